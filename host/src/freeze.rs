@@ -1,0 +1,397 @@
+//! From the float network of training to the integer image that modules run ([`composer_shared::policy`]), and how much is lost.
+//!
+//! Weights become int8 with one scale per output (the row's largest weight is 127). The latent message becomes int8 with one scale per channel, which costs
+//! nothing at run time: the key's scales are multiplied into the queries, the value's into the columns of the hidden layer. Those scales, and the
+//! queries', come from observations of real episodes (calibration): a few more bits for the common values are worth it to clip
+//! the rare ones, if the actions say so.
+
+use composer_shared::nn::{ARGUMENT_BITS, MAX_SHIFT, ONE};
+use composer_shared::observation::{Observation, SIZE};
+use composer_shared::policy::{
+    CLIP, CONTEXT_SHIFT, EMBED, Encoded, IMAGE_SIZE, ImageWriter, KEY, Latent, Layer, Meta, OUT, Policy, PolicyError, VALUE,
+};
+use composer_shared::robot::MAX_MODULES;
+
+use crate::network::{Dense, Network, NetworkError};
+
+/// Why a network cannot be frozen.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum FreezeError {
+    /// The network itself is unusable.
+    #[error(transparent)]
+    Network(#[from] NetworkError),
+    /// Network and description disagree.
+    #[error("the description says attention = {meta}, the network says {network}")]
+    Attention {
+        /// What the description says.
+        meta: bool,
+        /// What the network says.
+        network: bool,
+    },
+    /// Nothing to take scales from.
+    #[error("freezing needs observations of real episodes to choose scales from, and there are none")]
+    NoCalibration,
+    /// A step of more modules than a bus has.
+    #[error("a calibration step has {0} modules, at most {MAX_MODULES} are possible")]
+    Modules(usize),
+    /// An observation is infinite or not a number.
+    #[error("a calibration observation contains {0}, only finite numbers can be used")]
+    Observation(f32),
+    /// Weights too large for the fixed point of the layer.
+    #[error("the weights of the {layer} layer reach {largest:e}, too large for fixed point")]
+    Range {
+        /// Which layer.
+        layer: &'static str,
+        /// Its largest weight.
+        largest: f32,
+    },
+    /// The image would be refused.
+    #[error(transparent)]
+    Policy(#[from] PolicyError),
+}
+
+/// Difference between float and integer actions.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+pub struct Parity {
+    /// Root mean square, in fractions of the torque limit.
+    pub rms: f32,
+    /// Largest.
+    pub max: f32,
+    /// 99 of 100 differences are at most this.
+    pub p99: f32,
+    /// Actions compared, one for each axis of each module in each step.
+    pub samples: usize,
+}
+
+/// Shares of the latents that the int8 range covers, tried in turn.
+const COVERED: [f64; 4] = [1.0, 0.9999, 0.999, 0.99];
+/// Calibration steps used: more would not change a scale noticeably.
+const CALIBRATION_STEPS: usize = 1000;
+/// Of these, steps on which each choice of scales is tried out.
+const TRIAL_STEPS: usize = 200;
+/// How much larger than in calibration a query may be before it saturates; int16 has bits to spare.
+const QUERY_HEADROOM: f32 = 4.0;
+
+/// Freezes `network` to a policy image. `calibration` holds steps of episodes, each with the observations of all modules.
+pub fn freeze(network: &Network, meta: &Meta, calibration: &[Vec<Observation>]) -> Result<Vec<u8>, FreezeError> {
+    network.check()?;
+    if meta.attention != network.attention {
+        return Err(FreezeError::Attention { meta: meta.attention, network: network.attention });
+    }
+    if let Some(value) = calibration.iter().flatten().flatten().find(|x| !x.is_finite()) {
+        return Err(FreezeError::Observation(*value));
+    }
+    if let Some(step) = calibration.iter().find(|step| step.len() > MAX_MODULES) {
+        return Err(FreezeError::Modules(step.len()));
+    }
+    let steps = thin_out(calibration, CALIBRATION_STEPS);
+    if steps.iter().all(|step| step.is_empty()) {
+        return Err(FreezeError::NoCalibration);
+    }
+    if !network.attention {
+        return image(network, meta, &Scales { key: [1.0; KEY], value: [1.0; VALUE], query: 1.0 });
+    }
+    let samples = Samples::of(network, &steps);
+    let trial = thin_out(calibration, TRIAL_STEPS);
+    let mut best: Option<(f32, Vec<u8>)> = None;
+    for key in COVERED {
+        for value in COVERED {
+            let image = image(network, meta, &samples.scales(key, value))?;
+            let rms = compare(network, &Policy::parse(&image)?, trial.iter().copied()).rms;
+            if best.as_ref().is_none_or(|(least, _)| rms < *least) {
+                best = Some((rms, image));
+            }
+        }
+    }
+    best.map(|(_, image)| image).ok_or(FreezeError::NoCalibration)
+}
+
+/// Compares the actions of `network` and `policy` on `steps`, in which every module hears every other.
+///
+/// # Panics
+/// If a step has more than 64 modules.
+pub fn parity(network: &Network, policy: &Policy, steps: &[Vec<Observation>]) -> Parity {
+    compare(network, policy, steps.iter())
+}
+
+fn compare<'a>(network: &Network, policy: &Policy, steps: impl Iterator<Item = &'a Vec<Observation>>) -> Parity {
+    let mut differences = Vec::new();
+    for observations in steps {
+        let n = observations.len();
+        let mut float = vec![[0.0; OUT]; n];
+        network.act(observations, &vec![u64::MAX; n], &mut float, None);
+        let integer = act(policy, observations);
+        differences.extend(float.as_flattened().iter().zip(integer.as_flattened()).map(|(f, i)| (f - i).abs()));
+    }
+    differences.sort_by(f32::total_cmp);
+    let samples = differences.len();
+    let squares: f64 = differences.iter().map(|d| f64::from(*d).powi(2)).sum();
+    Parity {
+        rms: (squares / samples.max(1) as f64).sqrt() as f32,
+        max: differences.last().copied().unwrap_or(0.0),
+        p99: differences.get((samples * 99).div_ceil(100).saturating_sub(1)).copied().unwrap_or(0.0),
+        samples,
+    }
+}
+
+/// The actions of the integer `policy` for all modules of one robot, all of which hear each other.
+///
+/// # Panics
+/// If there are more than 64 modules.
+pub fn act(policy: &Policy, observations: &[Observation]) -> Vec<[f32; OUT]> {
+    let encoded: Vec<Encoded> = observations.iter().map(|o| policy.encode(o)).collect();
+    let mut latents = [Latent::ZERO; MAX_MODULES];
+    latents[..encoded.len()].iter_mut().zip(&encoded).for_each(|(to, from)| *to = from.latent);
+    let heard = u64::MAX.checked_shr(64 - encoded.len() as u32).unwrap_or(0);
+    encoded.iter().enumerate().map(|(i, own)| policy.act(own, &latents, heard, None, i)).collect()
+}
+
+/// At most `count` of `steps`, evenly spread.
+fn thin_out(steps: &[Vec<Observation>], count: usize) -> Vec<&Vec<Observation>> {
+    steps.iter().step_by(steps.len().div_ceil(count).max(1)).collect()
+}
+
+/// What one unit of the integers stands for.
+struct Scales {
+    key: [f32; KEY],
+    value: [f32; VALUE],
+    /// Of a query that has the key's scales multiplied in.
+    query: f32,
+}
+
+/// Magnitudes seen in calibration, in ascending order, channel by channel.
+struct Samples {
+    query: [Vec<f32>; KEY],
+    key: [Vec<f32>; KEY],
+    value: [Vec<f32>; VALUE],
+}
+
+impl Samples {
+    fn of(network: &Network, steps: &[&Vec<Observation>]) -> Self {
+        let mut samples = Samples {
+            query: [const { Vec::new() }; KEY],
+            key: [const { Vec::new() }; KEY],
+            value: [const { Vec::new() }; VALUE],
+        };
+        let push = |to: &mut [Vec<f32>], from: &[f32]| to.iter_mut().zip(from).for_each(|(to, x)| to.push(x.abs()));
+        for encoded in steps.iter().flat_map(|step| network.encode(step)) {
+            push(&mut samples.query, &encoded.query);
+            push(&mut samples.key, &encoded.key);
+            push(&mut samples.value, &encoded.value);
+        }
+        let all = samples.query.iter_mut().chain(&mut samples.key).chain(&mut samples.value);
+        all.for_each(|channel| channel.sort_by(f32::total_cmp));
+        samples
+    }
+
+    /// Scales that represent these shares of keys and values without clipping.
+    fn scales(&self, key_share: f64, value_share: f64) -> Scales {
+        let scale = |channel: &Vec<f32>, share: f64| {
+            let rank = (channel.len() as f64 * share).ceil() as usize;
+            let reach = channel.get(rank.clamp(1, channel.len().max(1)) - 1).copied().unwrap_or(0.0);
+            // A channel that is always zero may have any scale.
+            if reach > 1e-20 { reach / 127.0 } else { 1.0 }
+        };
+        let key = self.key.each_ref().map(|channel| scale(channel, key_share));
+        let value = self.value.each_ref().map(|channel| scale(channel, value_share));
+        let reaches = self.query.iter().zip(key).map(|(channel, key)| channel.last().copied().unwrap_or(0.0) * key);
+        let reach = reaches.fold(0.0, f32::max);
+        let query = if reach > 1e-20 { QUERY_HEADROOM * reach / f32::from(ONE) } else { 1.0 };
+        Scales { key, value, query }
+    }
+}
+
+/// Writes the image for given scales.
+fn image(network: &Network, meta: &Meta, scales: &Scales) -> Result<Vec<u8>, FreezeError> {
+    let one = f64::from(ONE);
+    let argument = f64::from(1u32 << ARGUMENT_BITS);
+    let mut image = Box::new([0; IMAGE_SIZE]);
+    let mut writer = ImageWriter::new(meta, &mut image);
+    for field in 0..SIZE {
+        let gain = one / (f64::from(CLIP) * f64::from(network.std[field]));
+        writer.input(field, network.mean[field], gain as f32);
+    }
+
+    // A unit of an activation, an integer input, is 1 / 32767; that of an input of the network 5 / 32767.
+    quantise(&mut writer, network, Layer::Encoder, |_| f64::from(CLIP), |_| argument / one, argument)?;
+    if network.attention {
+        let (key, value) = (scales.key, scales.value);
+        let per_query = move |o: usize| f64::from(key[o]) / f64::from(scales.query);
+        quantise(&mut writer, network, Layer::Query, |_| 1.0, |o| per_query(o) / one, 0.0)?;
+        quantise(&mut writer, network, Layer::Key, |_| 1.0, |o| 1.0 / f64::from(key[o]) / one, 0.0)?;
+        quantise(&mut writer, network, Layer::Value, |_| 1.0, |o| 1.0 / f64::from(value[o]) / one, 0.0)?;
+        // A unit of the logits in Q16 of base-2 logarithms.
+        let unit = f64::from(scales.query) / (KEY as f64).sqrt() * std::f64::consts::LOG2_E * 65536.0;
+        let shift = shift_for(unit).ok_or_else(|| range(network, Layer::Query))?;
+        writer.softmax((unit * 2f64.powi(shift.into())).round() as i32, shift);
+    } else {
+        writer.softmax(0, 1);
+    }
+    let context = |i: usize| f64::from(scales.value[i - EMBED]) * f64::from(1u32 << CONTEXT_SHIFT);
+    let column = |i: usize| match i {
+        0..EMBED => 1.0,
+        _ if network.attention => context(i),
+        _ => 0.0,
+    };
+    quantise(&mut writer, network, Layer::Hidden, column, |_| argument / one, argument)?;
+    quantise(&mut writer, network, Layer::Output, |_| 1.0, |_| 1.0, one)?;
+    writer.finish()?;
+    Ok(image.to_vec())
+}
+
+/// Writes one layer. `column(i)` is the factor that makes the units of all inputs alike; `unit(o)` turns a weight times an integer input into units
+/// of output `o`, and `bias_unit` a bias.
+fn quantise(
+    writer: &mut ImageWriter,
+    network: &Network,
+    layer: Layer,
+    column: impl Fn(usize) -> f64,
+    unit: impl Fn(usize) -> f64,
+    bias_unit: f64,
+) -> Result<(), FreezeError> {
+    let Dense { inputs, outputs, weights, bias } = network.layer(layer).1;
+    let rows: Vec<Vec<f64>> = weights
+        .chunks_exact(*inputs)
+        .map(|row| row.iter().enumerate().map(|(i, weight)| f64::from(*weight) * column(i)).collect())
+        .collect();
+    let steps: Vec<f64> = rows.iter().map(|row| row.iter().fold(0.0f64, |m, w| m.max(w.abs())) / 127.0).collect();
+    let multipliers: Vec<f64> = (0..*outputs).map(|o| steps[o] * unit(o)).collect();
+    let largest = multipliers.iter().copied().fold(0.0, f64::max);
+    let shift = shift_for(largest).ok_or_else(|| range(network, layer))?;
+    writer.shift(layer, shift);
+    for (o, row) in rows.iter().enumerate() {
+        let weights: Vec<i8> =
+            row.iter().map(|weight| if steps[o] > 0.0 { (weight / steps[o]).round() as i8 } else { 0 }).collect();
+        let multiplier = (multipliers[o] * 2f64.powi(shift.into())).round() as i32;
+        // `as` saturates; a bias that large drives its output into saturation anyway.
+        let bias = (f64::from(bias.get(o).copied().unwrap_or(0.0)) * bias_unit).round() as i32;
+        writer.row(layer, o, multiplier, bias, &weights);
+    }
+    Ok(())
+}
+
+/// The largest shift with which `largest * 2^shift` still is an i32.
+fn shift_for(largest: f64) -> Option<u8> {
+    (1..=MAX_SHIFT).rev().find(|shift| largest * 2f64.powi((*shift).into()) < f64::from(i32::MAX))
+}
+
+fn range(network: &Network, layer: Layer) -> FreezeError {
+    let (layer, dense) = network.layer(layer);
+    FreezeError::Range { layer, largest: dense.weights.iter().fold(0.0, |m: f32, w| m.max(w.abs())) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::network::testing::{observations, random_network};
+    use composer_shared::policy::{GoalKnownTo, Task};
+    use composer_shared::robot::{Geometry, Limits};
+
+    fn meta(attention: bool) -> Meta {
+        Meta {
+            task: Task::GoalReaching,
+            goal_known_to: GoalKnownTo::Head,
+            attention,
+            trained_with_faults: true,
+            geometry: Geometry::default(),
+            limits: Limits::default(),
+            control_period_us: 50_000,
+            relax_seconds: 0.3,
+        }
+    }
+
+    fn steps(seed: u64, count: u64, modules: usize) -> Vec<Vec<Observation>> {
+        (0..count).map(|step| observations(seed * 1_000_003 + step, modules)).collect()
+    }
+
+    #[test]
+    fn integers_follow_the_float_network() {
+        let mut worst = 0.0f32;
+        for seed in 0..20 {
+            let attention = seed % 4 != 3;
+            let network = random_network(seed, attention);
+            let image = freeze(&network, &meta(attention), &steps(seed, 300, 8)).unwrap();
+            let policy = Policy::parse(&image).unwrap();
+            assert_eq!(policy.meta(), meta(attention));
+            for modules in [1, 8, 11, 64] {
+                let parity = parity(&network, &policy, &steps(seed + 100, 1 + 400 / modules as u64, modules));
+                println!("seed {seed}, {modules} modules, attention {attention}: {parity:?}");
+                assert!(parity.rms < 0.01 && parity.p99 < 0.025 && parity.max < 0.05, "{parity:?}");
+                worst = worst.max(parity.max);
+            }
+        }
+        println!("largest difference of an action: {worst:.4}");
+    }
+
+    #[test]
+    fn attention_of_integers_follows_the_float_network() {
+        let network = random_network(1, true);
+        let image = freeze(&network, &meta(true), &steps(1, 300, 8)).unwrap();
+        let policy = Policy::parse(&image).unwrap();
+        let mut worst = 0.0f32;
+        for step in steps(2, 100, 8) {
+            let (mut actions, mut expected) = ([[0.0; 2]; 8], [0.0; 64]);
+            let heard = [0b1010_0110; 8];
+            network.act(&step, &heard, &mut actions, Some(&mut expected));
+            let encoded: Vec<_> = step.iter().map(|o| policy.encode(o)).collect();
+            let mut latents = [Latent::ZERO; MAX_MODULES];
+            (0..8).for_each(|j| latents[j] = encoded[j].latent);
+            for i in 0..8 {
+                let mut weights = [0; MAX_MODULES];
+                let action = policy.act(&encoded[i], &latents, heard[i], Some(&mut weights), i);
+                (0..2).for_each(|axis| assert!((action[axis] - actions[i][axis]).abs() < 0.05));
+                for j in 0..8 {
+                    worst = worst.max((f32::from(weights[j]) / 32767.0 - expected[8 * i + j]).abs());
+                }
+                assert!(weights[8..].iter().all(|w| *w == 0));
+            }
+        }
+        println!("largest difference of an attention weight: {worst:.4}");
+        assert!(worst < 0.03, "{worst}");
+    }
+
+    #[test]
+    fn a_network_of_zeros_and_one_of_small_weights_freeze() {
+        let network = Network::zeros(true);
+        let image = freeze(&network, &meta(true), &steps(5, 10, 4)).unwrap();
+        assert_eq!(parity(&network, &Policy::parse(&image).unwrap(), &steps(6, 10, 4)).max, 0.0);
+        // As right after initialisation: an output layer near zero must not come out as exactly zero.
+        let mut network = random_network(7, true);
+        network.output.weights.iter_mut().for_each(|w| *w *= 1e-3);
+        network.output.bias.fill(0.0);
+        let image = freeze(&network, &meta(true), &steps(7, 10, 4)).unwrap();
+        let policy = Policy::parse(&image).unwrap();
+        assert!(parity(&network, &policy, &steps(8, 10, 4)).max < 1e-4);
+        assert!(act(&policy, &observations(8, 4)).as_flattened().iter().any(|a| *a != 0.0));
+    }
+
+    #[test]
+    fn what_cannot_be_frozen_is_refused_in_one_sentence() {
+        let network = random_network(9, true);
+        let said = |network: &Network, meta: &Meta, steps: &[Vec<Observation>]| {
+            freeze(network, meta, steps).unwrap_err().to_string()
+        };
+        let good = steps(9, 3, 8);
+        assert!(said(&network, &meta(true), &[]).contains("needs observations of real episodes"));
+        assert!(said(&network, &meta(false), &good).contains("attention = false"));
+        assert!(said(&network, &meta(true), &steps(9, 1, 65)).contains("65 modules"));
+        let mut bad = good.clone();
+        bad[1][2][3] = f32::INFINITY;
+        assert!(said(&network, &meta(true), &bad).contains("contains inf"));
+        let mut broken = network.clone();
+        broken.query.weights[0] = f32::NAN;
+        assert!(said(&broken, &meta(true), &good).contains("the query layer"));
+        let mut huge = network.clone();
+        huge.hidden.weights[0] = 1e30;
+        assert!(said(&huge, &meta(true), &good).contains("too large for fixed point"));
+        let endless = Meta { relax_seconds: f32::INFINITY, ..meta(true) };
+        assert!(said(&network, &endless, &good).contains("relaxation time"));
+    }
+
+    #[test]
+    fn the_same_network_gives_the_same_image() {
+        let network = random_network(10, true);
+        let calibration = steps(10, 50, 8);
+        assert_eq!(freeze(&network, &meta(true), &calibration), freeze(&network, &meta(true), &calibration));
+    }
+}

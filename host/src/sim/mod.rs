@@ -1,0 +1,335 @@
+//! The snake in rapier.
+//!
+//! A chain of capsules joined by hinges (impulse joints). A joint's spring, its motor and the motor's torque-speed line are one
+//! implicit spring-damper: the torque command `tau` moves the spring's target to `tau / k`, so that the joint feels
+//! `tau - k q - c w`, and `c = tau_max / no-load speed` is the slope of the torque-speed line. Implicit, because at these
+//! stiffnesses an explicit torque would need a tenth of the step.
+//!
+//! Ground, walls and blocks are frictionless for rapier; friction is an explicit anisotropic Coulomb force in the plane of each
+//! contact, with the contact's own load, normal and point ([`Snake::apply_friction`]).
+//!
+//! World frame: x and y horizontal, z up; the snake lies along x with its head towards +x.
+
+use composer_shared::observation::Sensors;
+use composer_shared::robot::{self, AXES, Geometry, MAX_JOINTS};
+use rapier3d::dynamics::JointAxesMask;
+use rapier3d::prelude::*;
+
+use crate::robot::Robot;
+
+/// Below this sliding speed (units/s) friction fades out linearly instead of flipping its sign.
+const STILL_SPEED: f32 = 0.01;
+/// Faster than the no-load speed the drive brakes with this many times its normal damping.
+const OVERSPEED_BRAKE: f32 = 8.0;
+
+/// Extremes of the motion, for the sanity of what was learnt.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Motion {
+    /// Fastest link since the last reset, units/s.
+    pub peak_link_speed: f32,
+    /// Highest link centre since the last reset, units above the ground.
+    pub peak_height: f32,
+    /// Fastest joint since the last reset, rad/s.
+    pub peak_joint_speed: f32,
+}
+
+/// The snake and its scene.
+pub struct Snake {
+    robot: Robot,
+    world: PhysicsWorld,
+    links: Vec<RigidBodyHandle>,
+    joints: Vec<ImpulseJointHandle>,
+    /// Torque on each axis of each module now, and where it is heading.
+    torque: Vec<[f32; AXES]>,
+    command: Vec<[f32; AXES]>,
+    motion: Motion,
+}
+
+/// Collision groups: one bit for the scene, 31 that the modules share in turn. A link meets the scene and the links of
+/// modules that are not its neighbours (the capsules of neighbours overlap by construction).
+fn groups(module: usize) -> InteractionGroups {
+    let bit = |m: usize| 1u32 << (m % 31);
+    let near = bit(module) | bit(module + 1) | bit(module + 30);
+    InteractionGroups::new(
+        Group::from_bits_retain(bit(module)),
+        Group::from_bits_retain(!near),
+        InteractionTestMode::And,
+    )
+}
+
+impl Snake {
+    /// A straight snake at rest on level ground, its head link centred at the origin.
+    pub fn new(robot: &Robot) -> Self {
+        let mut world = PhysicsWorld { gravity: Vector::new(0.0, 0.0, -robot.gravity), ..PhysicsWorld::default() };
+        let parameters = &mut world.integration_parameters;
+        parameters.dt = robot.physics_step;
+        parameters.num_solver_iterations = robot.solver_iterations;
+        parameters.num_internal_stabilization_iterations = 0;
+        parameters.max_ccd_substeps = 0;
+        parameters.contact_clustering = false;
+        world.colliders.insert(
+            ColliderBuilder::halfspace(rapier3d::na::Unit::new_unchecked(Vector::Z))
+                .friction(0.0)
+                .collision_groups(InteractionGroups::new(Group::GROUP_32, Group::ALL, InteractionTestMode::And))
+                .build(),
+        );
+        let (length, radius) = (robot.link_length, robot.link_radius);
+        let mut links = Vec::with_capacity(robot.links());
+        let mut joints = Vec::with_capacity(robot.links() - 1);
+        for link in 0..robot.links() {
+            let module = link / robot.links_per_module;
+            let body = RigidBodyBuilder::dynamic()
+                .translation(Vector::new(-(link as f32) * length, 0.0, radius))
+                .can_sleep(false)
+                .additional_mass_properties(MassProperties::new(
+                    Vector::ZERO,
+                    robot.link_mass,
+                    Vector::splat(robot.link_inertia),
+                ));
+            let handle = world.bodies.insert(body);
+            let collider = ColliderBuilder::capsule_x(0.5 * length, radius)
+                .density(0.0)
+                .friction(0.0)
+                .collision_groups(groups(module))
+                .user_data(link as u128);
+            world.colliders.insert_with_parent(collider, handle, &mut world.bodies);
+            if let Some(&front) = links.last() {
+                let joint_in_module = (link - 1) % robot.links_per_module;
+                let axis = if joint_in_module % 2 == 0 { Vector::Z } else { Vector::Y };
+                let joint = GenericJointBuilder::new(JointAxesMask::LOCKED_REVOLUTE_AXES)
+                    .local_axis1(axis)
+                    .local_axis2(axis)
+                    .local_anchor1(Vector::new(-0.5 * length, 0.0, 0.0))
+                    .local_anchor2(Vector::new(0.5 * length, 0.0, 0.0))
+                    .motor_model(JointAxis::AngX, MotorModel::ForceBased)
+                    .set_motor(JointAxis::AngX, 0.0, 0.0, robot.stiffness, robot.joint_damping())
+                    .contacts_enabled(false)
+                    .build();
+                joints.push(world.impulse_joints.insert(front, handle, joint, true));
+            }
+            links.push(handle);
+        }
+        Snake {
+            robot: robot.clone(),
+            world,
+            links,
+            joints,
+            torque: vec![[0.0; AXES]; robot.modules],
+            command: vec![[0.0; AXES]; robot.modules],
+            motion: Motion::default(),
+        }
+    }
+
+    /// The robot.
+    pub fn robot(&self) -> &Robot {
+        &self.robot
+    }
+
+    /// Physics steps taken in `seconds`.
+    pub fn steps_in(&self, seconds: f32) -> usize {
+        (seconds / self.robot.physics_step).round() as usize
+    }
+
+    /// The torque (robot units) that a module commands; its motors slew towards it from the next step on.
+    pub fn set_torque(&mut self, module: usize, torque: [f32; AXES]) {
+        self.command[module] = torque.map(|t| t.clamp(-self.robot.torque_limit, self.robot.torque_limit));
+    }
+
+    /// The torque that acts on the joints of a module now.
+    pub fn torque(&self, module: usize) -> [f32; AXES] {
+        self.torque[module]
+    }
+
+    /// Advances by one physics step.
+    pub fn step(&mut self) {
+        let step = self.robot.torque_slew * self.robot.physics_step;
+        for (torque, command) in self.torque.iter_mut().zip(&self.command) {
+            for axis in 0..AXES {
+                torque[axis] = robot::slew(torque[axis], command[axis], step);
+            }
+        }
+        let damping = self.robot.joint_damping();
+        for index in 0..self.joints.len() {
+            let speed = self.joint_speed(index).abs();
+            self.motion.peak_joint_speed = self.motion.peak_joint_speed.max(speed);
+            let (module, k) = (index / self.robot.links_per_module, index % self.robot.links_per_module);
+            let target = self.torque[module][k % 2] / self.robot.stiffness;
+            let over = (speed / self.robot.joint_speed_limit - 1.0).clamp(0.0, 1.0);
+            if let Some(joint) = self.world.impulse_joints.get_mut(self.joints[index], false) {
+                let motor = &mut joint.data.motors[JointAxis::AngX as usize];
+                motor.target_pos = target;
+                motor.damping = damping * (1.0 + OVERSPEED_BRAKE * over);
+            }
+        }
+        self.apply_friction();
+        self.world.step();
+        for &link in &self.links {
+            let body = &self.world.bodies[link];
+            self.motion.peak_link_speed = self.motion.peak_link_speed.max(body.linvel().length());
+            self.motion.peak_height = self.motion.peak_height.max(body.translation().z);
+        }
+    }
+
+    /// Anisotropic Coulomb friction from the contacts of the last step: in the plane of each contact, opposed to the sliding of
+    /// the link's contact point, with one coefficient along the link and another across it. The force that would stop the
+    /// link within the step is its upper bound, so that friction never drives.
+    fn apply_friction(&mut self) {
+        for &link in &self.links {
+            let body = &mut self.world.bodies[link];
+            body.reset_forces(false);
+            body.reset_torques(false);
+        }
+        let dt = self.robot.physics_step;
+        let (along, across) = (self.robot.friction_along, self.robot.friction_across);
+        for pair in self.world.narrow_phase.contact_pairs() {
+            for manifold in pair.solver_manifolds() {
+                let load: f32 = manifold.points.iter().map(|p| p.data.impulse).sum::<f32>() / dt;
+                if load <= 0.0 {
+                    continue;
+                }
+                // The frame of the first collider carries the contact point; impulses weigh the points of a line contact.
+                let position1 = self.world.colliders[pair.collider1].position();
+                let weighted: Vector = manifold.points.iter().map(|p| p.local_p1 * p.data.impulse).sum();
+                let point = position1.transform_point(weighted / (load * dt));
+                let normal = manifold.data.normal;
+                let of = |collider: ColliderHandle| {
+                    let parent = self.world.colliders[collider].parent()?;
+                    let body = &self.world.bodies[parent];
+                    body.is_dynamic().then_some(parent)
+                };
+                let (one, two) = (of(pair.collider1), of(pair.collider2));
+                let velocity = |body: Option<RigidBodyHandle>| {
+                    body.map_or(Vector::ZERO, |b| self.world.bodies[b].velocity_at_point(point))
+                };
+                let Some(link) = two.or(one) else { continue };
+                let sliding = velocity(two) - velocity(one);
+                let sliding = sliding - normal * sliding.dot(normal);
+                let body = &self.world.bodies[link];
+                let axis = body.rotation() * Vector::X;
+                let axial = (axis - normal * axis.dot(normal)).normalize_or_zero();
+                let v_along = axial * sliding.dot(axial);
+                let v_across = sliding - v_along;
+                let speed = sliding.length();
+                let stopping = across * load * dt / body.mass();
+                let scale = load / speed.max(STILL_SPEED).max(stopping);
+                let force = -(v_along * along + v_across * across) * scale;
+                if let Some(two) = two {
+                    self.world.bodies[two].add_force_at_point(force, point, false);
+                }
+                if let Some(one) = one {
+                    self.world.bodies[one].add_force_at_point(-force, point, false);
+                }
+            }
+        }
+    }
+
+    fn joint_speed(&self, index: usize) -> f32 {
+        let (front, rear) = (&self.world.bodies[self.links[index]], &self.world.bodies[self.links[index + 1]]);
+        let axis = if (index % self.robot.links_per_module) % 2 == 0 { Vector::Z } else { Vector::Y };
+        (rear.angvel() - front.angvel()).dot(front.rotation() * axis)
+    }
+
+    fn joint_angle(&self, index: usize) -> f32 {
+        let (front, rear) = (&self.world.bodies[self.links[index]], &self.world.bodies[self.links[index + 1]]);
+        let relative = front.rotation().inverse() * *rear.rotation();
+        let axial = if (index % self.robot.links_per_module) % 2 == 0 { relative.z } else { relative.y };
+        let angle = 2.0 * libm::atan2f(axial, relative.w);
+        // q and -q are the same rotation.
+        if angle > std::f32::consts::PI {
+            angle - std::f32::consts::TAU
+        } else if angle < -std::f32::consts::PI {
+            angle + std::f32::consts::TAU
+        } else {
+            angle
+        }
+    }
+
+    /// One sample of a module's sensors.
+    pub fn sensors(&self, module: usize) -> Sensors {
+        let links = self.robot.links_per_module;
+        let mut sensors = Sensors { temperature: 25.0, ..Sensors::ZERO };
+        for k in 0..links.min(MAX_JOINTS) {
+            let index = module * links + k;
+            if index < self.joints.len() {
+                sensors.joint_angles[k] = self.joint_angle(index);
+                sensors.joint_speeds[k] = self.joint_speed(index);
+            }
+        }
+        let body = self.own_link(module);
+        let to_own = body.rotation().inverse();
+        sensors.up = (to_own * Vector::Z).to_array();
+        sensors.angular_rate = (to_own * body.angvel()).to_array();
+        sensors.torque = self.torque[module].map(|t| t / self.robot.torque_limit);
+        sensors
+    }
+
+    fn own_link(&self, module: usize) -> &RigidBody {
+        let own = Geometry::OWN_LINK.min(self.robot.links_per_module - 1);
+        &self.world.bodies[self.links[module * self.robot.links_per_module + own]]
+    }
+
+    /// What no real module could measure, for the critic of the training alone: linear velocity in the own frame (units/s) and height of the own link.
+    pub fn privileged(&self, module: usize) -> ([f32; 3], f32) {
+        let body = self.own_link(module);
+        ((body.rotation().inverse() * body.linvel()).to_array(), body.translation().z)
+    }
+
+    /// A world point in the own frame of a module.
+    pub fn in_own_frame(&self, module: usize, point: [f32; 3]) -> [f32; 3] {
+        self.own_link(module).position().inverse_transform_point(Vector::from(point)).to_array()
+    }
+
+    /// Centre of the head link in the world.
+    pub fn head(&self) -> [f32; 3] {
+        self.world.bodies[self.links[0]].translation().to_array()
+    }
+
+    /// A world point in the frame of the head link.
+    pub fn in_head_frame(&self, point: [f32; 3]) -> [f32; 3] {
+        self.world.bodies[self.links[0]].position().inverse_transform_point(Vector::from(point)).to_array()
+    }
+
+    /// Position and rotation (quaternion x, y, z, w) of every link, from the head on.
+    pub fn poses(&self) -> impl Iterator<Item = ([f32; 3], [f32; 4])> + '_ {
+        self.links.iter().map(|&link| {
+            let body = &self.world.bodies[link];
+            let r = body.rotation();
+            (body.translation().to_array(), [r.x, r.y, r.z, r.w])
+        })
+    }
+
+    /// Height of the highest link centre now, units above the ground.
+    pub fn height(&self) -> f32 {
+        self.links.iter().map(|&l| self.world.bodies[l].translation().z).fold(0.0, f32::max)
+    }
+
+    /// Kinetic plus potential energy (gravity and joint springs), for tests of the physics.
+    pub fn energy(&self) -> f32 {
+        let bodies = self.links.iter().map(|&l| &self.world.bodies[l]);
+        let moving: f32 = bodies
+            .map(|b| {
+                0.5 * self.robot.link_mass * b.linvel().length_squared()
+                    + 0.5 * self.robot.link_inertia * b.angvel().length_squared()
+                    + self.robot.link_mass * self.robot.gravity * b.translation().z
+            })
+            .sum();
+        let springs: f32 =
+            (0..self.joints.len()).map(|j| 0.5 * self.robot.stiffness * self.joint_angle(j).powi(2)).sum();
+        moving + springs
+    }
+
+    /// Largest distance between the two halves of a joint, units: how far the solver let the chain come apart.
+    pub fn joint_gap(&self) -> f32 {
+        let half = Vector::new(0.5 * self.robot.link_length, 0.0, 0.0);
+        let gap = |pair: &[RigidBodyHandle]| {
+            let (front, rear) = (self.world.bodies[pair[0]].position(), self.world.bodies[pair[1]].position());
+            front.transform_point(-half).distance(rear.transform_point(half))
+        };
+        self.links.windows(2).map(gap).fold(0.0, f32::max)
+    }
+
+    /// Extremes of the motion so far.
+    pub fn motion(&self) -> Motion {
+        self.motion
+    }
+}

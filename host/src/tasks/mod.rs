@@ -1,0 +1,3 @@
+//! The paper's tasks, one file each: scene, goals, reward, success.
+
+pub mod goal_reaching;

@@ -1,0 +1,16 @@
+#![no_std]
+#![forbid(unsafe_code)]
+//! What the firmware of a snake module and the host that trains it must agree on, written once.
+//!
+//! No I/O, no allocation, no operating system. Lengths are in *robot units* (SomoGym's scale, see [`robot`]), angles in
+//! radians, times in seconds unless a name says otherwise.
+
+#[cfg(test)]
+extern crate std;
+
+pub mod kinematics;
+pub mod nn;
+pub mod observation;
+pub mod policy;
+pub mod robot;
+pub mod wire;

@@ -1,0 +1,259 @@
+//! The frames as a table: what documents, DBC files and the parser's length check are made from.
+
+use core::fmt::{self, Write};
+
+use super::{
+    EmergencyStop, Fault, Fragment, Frame, Function, Goal, Heartbeat, LATENT_SIZE, LatentMessage, STATION, State, Sync,
+    Telemetry,
+};
+use crate::robot::MAX_MODULES;
+
+/// Who may send a frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Senders {
+    /// Modules only.
+    Modules,
+    /// The station only.
+    Station,
+    /// Both.
+    Both,
+}
+
+impl Senders {
+    /// Whether `module` is one of them.
+    pub fn may_send(self, module: u8) -> bool {
+        match self {
+            Senders::Modules => usize::from(module) < MAX_MODULES,
+            Senders::Station => module == STATION,
+            Senders::Both => true,
+        }
+    }
+}
+
+/// A field of a frame, or several equal ones in a row.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Field {
+    /// Name; with a number appended where there are several.
+    pub name: &'static str,
+    /// How many in a row.
+    pub count: u8,
+    /// Bits of each; fields follow one another, least significant bit first.
+    pub bits: u8,
+    /// Two's complement.
+    pub signed: bool,
+    /// Value of one step.
+    pub scale: f64,
+    /// Unit of the value.
+    pub unit: &'static str,
+}
+
+/// A frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Layout {
+    /// What it says.
+    pub function: Function,
+    /// Who may send it.
+    pub senders: Senders,
+    /// Bytes without padding.
+    pub size: usize,
+    /// Its fields in order, without gaps.
+    pub fields: &'static [Field],
+}
+
+impl Layout {
+    /// Bytes on the wire, padding included.
+    pub fn wire_len(&self) -> u8 {
+        Frame::padded_len(self.size, true).unwrap_or(64)
+    }
+}
+
+const fn unsigned(name: &'static str, bits: u8) -> Field {
+    Field { name, count: 1, bits, signed: false, scale: 1.0, unit: "" }
+}
+
+const fn signed(name: &'static str, count: u8, bits: u8, scale: f64, unit: &'static str) -> Field {
+    Field { name, count, bits, signed: true, scale, unit }
+}
+
+/// All frames, most urgent first.
+pub const LAYOUTS: [Layout; 8] = [
+    Layout {
+        function: Function::EmergencyStop,
+        senders: Senders::Both,
+        size: 2,
+        fields: &[unsigned("command", 8), unsigned("reason", 8)],
+    },
+    Layout {
+        function: Function::Sync,
+        senders: Senders::Modules,
+        size: 4,
+        fields: &[unsigned("cycle", 16), unsigned("alive", 8), unsigned("reserved", 8)],
+    },
+    Layout {
+        function: Function::Goal,
+        senders: Senders::Station,
+        size: 8,
+        fields: &[
+            unsigned("cycle", 8),
+            unsigned("known", 1),
+            unsigned("reserved", 7),
+            signed("position", 3, 16, 0.00390625, "unit"),
+        ],
+    },
+    Layout {
+        function: Function::State,
+        senders: Senders::Modules,
+        size: 8,
+        fields: &[
+            unsigned("cycle", 8),
+            unsigned("health", 8),
+            signed("angle", 4, 12, core::f64::consts::PI / 2048.0, "rad"),
+        ],
+    },
+    Layout {
+        function: Function::Latent,
+        senders: Senders::Modules,
+        size: LATENT_SIZE,
+        fields: &[
+            unsigned("cycle", 8),
+            unsigned("health", 8),
+            unsigned("policy", 16),
+            signed("key", 16, 8, 1.0, ""),
+            signed("value", 32, 8, 1.0, ""),
+        ],
+    },
+    Layout {
+        function: Function::LatentFragment,
+        senders: Senders::Modules,
+        size: 8,
+        fields: &[
+            unsigned("cycle4", 4),
+            unsigned("index", 3),
+            unsigned("reserved", 1),
+            Field { count: 7, ..unsigned("data", 8) },
+        ],
+    },
+    Layout {
+        function: Function::Telemetry,
+        senders: Senders::Modules,
+        size: 8,
+        fields: &[
+            signed("torque", 2, 8, 1.0 / 127.0, "limit"),
+            signed("temperature", 1, 8, 1.0, "degC"),
+            unsigned("limited_by", 8),
+            unsigned("heard", 8),
+            unsigned("deadline_misses", 8),
+            unsigned("attends_to", 8),
+            Field { scale: 1.0 / 255.0, ..unsigned("attention", 8) },
+        ],
+    },
+    Layout {
+        function: Function::Heartbeat,
+        senders: Senders::Modules,
+        size: 8,
+        fields: &[
+            unsigned("mode", 8),
+            unsigned("fault", 8),
+            unsigned("health", 8),
+            unsigned("time_keeper", 8),
+            unsigned("protocol", 8),
+            unsigned("firmware", 8),
+            unsigned("policy", 16),
+        ],
+    },
+];
+
+/// The layout of the frames that say `function`.
+pub(super) fn of(function: Function) -> &'static Layout {
+    match function {
+        Function::EmergencyStop => &LAYOUTS[0],
+        Function::Sync => &LAYOUTS[1],
+        Function::Goal => &LAYOUTS[2],
+        Function::State => &LAYOUTS[3],
+        Function::Latent => &LAYOUTS[4],
+        Function::LatentFragment => &LAYOUTS[5],
+        Function::Telemetry => &LAYOUTS[6],
+        Function::Heartbeat => &LAYOUTS[7],
+    }
+}
+
+/// A struct's size in memory is its size on the wire (no padding between fields), and the table's fields fill it exactly.
+const fn check(index: usize, function: Function, size: usize) {
+    let layout = &LAYOUTS[index];
+    assert!(layout.function as u8 == function as u8 && layout.size == size);
+    let (mut bits, mut i) = (0, 0);
+    while i < layout.fields.len() {
+        bits += layout.fields[i].bits as usize * layout.fields[i].count as usize;
+        i += 1;
+    }
+    assert!(bits == 8 * size);
+}
+
+const _: () = {
+    check(0, Function::EmergencyStop, size_of::<EmergencyStop>());
+    check(1, Function::Sync, size_of::<Sync>());
+    check(2, Function::Goal, size_of::<Goal>());
+    check(3, Function::State, size_of::<State>());
+    check(4, Function::Latent, size_of::<LatentMessage>());
+    check(5, Function::LatentFragment, size_of::<Fragment>());
+    check(6, Function::Telemetry, size_of::<Telemetry>());
+    check(7, Function::Heartbeat, size_of::<Heartbeat>());
+};
+
+/// Writes a DBC file of all frames of a robot with `modules` modules and its station, for candump users' tools (cantools,
+/// SavvyCAN, Kayak). Frames with more than 8 bytes are marked as CAN-FD with bit-rate switch (`VFrameFormat` 14).
+pub fn dbc(out: &mut impl Write, modules: u8) -> fmt::Result {
+    let modules = modules.min(MAX_MODULES as u8);
+    out.write_str("VERSION \"\"\n\nNS_ :\n\nBS_:\n\nBU_: STATION")?;
+    (0..modules).try_for_each(|m| write!(out, " M{m}"))?;
+    out.write_str("\n")?;
+    let frames = || {
+        LAYOUTS.iter().flat_map(move |layout| {
+            let senders = (0..modules).chain([STATION]);
+            senders.filter(|m| layout.senders.may_send(*m)).map(move |m| (layout, m))
+        })
+    };
+    for (layout, module) in frames() {
+        let name = layout.function.name();
+        let (id, len) = (layout.function.id(module), layout.wire_len());
+        if module == STATION {
+            writeln!(out, "\nBO_ {id} {name}_STATION: {len} STATION")?;
+        } else {
+            writeln!(out, "\nBO_ {id} {name}_M{module}: {len} M{module}")?;
+        }
+        let mut start = 0u16;
+        for field in layout.fields {
+            for k in 0..field.count {
+                let sign = if field.signed { '-' } else { '+' };
+                write!(out, " SG_ {}", field.name)?;
+                if field.count > 1 {
+                    write!(out, "_{k}")?;
+                }
+                let steps = (1u64 << (field.bits - u8::from(field.signed))) as f64;
+                let (low, high) = (if field.signed { -steps * field.scale } else { 0.0 }, (steps - 1.0) * field.scale);
+                writeln!(
+                    out,
+                    " : {start}|{}@1{sign} ({},0) [{low}|{high}] \"{}\" Vector__XXX",
+                    field.bits, field.scale, field.unit
+                )?;
+                start += u16::from(field.bits);
+            }
+        }
+    }
+    out.write_str("\nBA_DEF_ \"BusType\" STRING ;\nBA_DEF_ BO_ \"VFrameFormat\" ENUM \"StandardCAN\",\"ExtendedCAN\"")?;
+    (2..14).try_for_each(|_| out.write_str(",\"reserved\""))?;
+    out.write_str(",\"StandardCAN_FD\",\"ExtendedCAN_FD\";\n")?;
+    out.write_str("BA_DEF_DEF_ \"BusType\" \"CAN\";\nBA_DEF_DEF_ \"VFrameFormat\" \"StandardCAN\";\n")?;
+    out.write_str("BA_ \"BusType\" \"CAN FD\";\n")?;
+    for (layout, module) in frames().filter(|(layout, _)| layout.wire_len() > 8) {
+        writeln!(out, "BA_ \"VFrameFormat\" BO_ {} 14;", layout.function.id(module))?;
+    }
+    for (layout, module) in frames().filter(|(layout, _)| layout.function == Function::Heartbeat) {
+        let id = layout.function.id(module);
+        writeln!(out, "VAL_ {id} mode 0 \"boot\" 1 \"active\" 2 \"relaxed\" 3 \"alone\" ;")?;
+        write!(out, "VAL_ {id} fault 0 \"none\"")?;
+        Fault::ALL.into_iter().try_for_each(|f| write!(out, " {} \"{f:?}\"", f as u8))?;
+        out.write_str(" ;\n")?;
+    }
+    Ok(())
+}

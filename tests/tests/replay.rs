@@ -1,0 +1,212 @@
+//! A replay is one file that opens offline: checked in its text, and by opening it in a headless Chromium.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use composer_host::replay::{Episode, FrameRecord, Outline, Pose, Recording, Robot, Shape, Status, attention_bytes};
+
+const PERIOD: f32 = 0.05;
+const LINKS: usize = 4;
+
+/// A snake that winds its way towards a goal at the left; `unplugged` loses its power half way.
+fn episode(modules: usize, frames: usize, unplugged: usize) -> Episode {
+    let (length, goal) = (0.5, [14.0, 7.0, 0.4]);
+    // The head's path, sampled finely: a wave about a direction that turns slowly. The body follows in its track.
+    let ds = 0.02;
+    let before = (modules * LINKS) as f32 * length + 1.0;
+    let ahead = frames as f32 * 0.15;
+    let angle = |s: f32| 0.75 * (s * 0.9).sin() + 0.045 * s.max(0.0);
+    let mut path = vec![[0.0f32; 3]];
+    let samples = ((before + ahead) / ds) as usize;
+    for i in 0..samples {
+        let (s, last) = (i as f32 * ds - before, path[i]);
+        path.push([last[0] + ds * angle(s).cos(), last[1] + ds * angle(s).sin(), 0.0]);
+    }
+    let shift = path[(before / ds) as usize];
+    let mut episode = Episode::new(format!("goal ahead and left, {modules} modules"));
+    for frame in 0..frames {
+        let head = frame as f32 * 0.15;
+        let at = |link: usize| {
+            let s = head - link as f32 * length;
+            let p = path[(((s + before) / ds) as usize).min(samples)];
+            let half = angle(s) / 2.0;
+            let lift = 0.4 + 0.12 * (1.0 + (s * 1.8 + head).sin()) * 0.5;
+            Pose {
+                position: [p[0] - shift[0], p[1] - shift[1], lift],
+                rotation: [0.0, 0.0, half.sin(), half.cos()],
+            }
+        };
+        let links: Vec<Pose> = (0..modules * LINKS).map(at).collect();
+        let late = frame > frames / 2;
+        let distance = (0..3).map(|a| (links[0].position[a] - goal[a]).powi(2)).sum::<f32>().sqrt();
+        let mut status = vec![Status::Ok; modules];
+        let mut torques: Vec<[f32; 2]> = (0..modules)
+            .map(|m| {
+                let phase = head - 1.3 * m as f32;
+                [70.0 * phase.sin(), 25.0 * (2.0 * phase).cos()]
+            })
+            .collect();
+        if late {
+            status[unplugged] = Status::Unplugged;
+            torques[unplugged] = [0.0; 2];
+        }
+        let mut weights = vec![0.0f32; modules * modules];
+        for (i, row) in weights.chunks_mut(modules).enumerate() {
+            let peak = (head * 0.35).min(modules as f32 - 1.0);
+            for (j, w) in row.iter_mut().enumerate() {
+                let heard = i == j || !(late && (i == unplugged || j == unplugged));
+                let near = -(j as f32 - peak).powi(2) / 3.0;
+                *w = if heard { (near + 0.8 * ((i * 3 + j * 5) as f32).sin()).exp() + 0.2 } else { 0.0 };
+            }
+            let sum: f32 = row.iter().sum();
+            row.iter_mut().for_each(|w| *w /= sum);
+        }
+        episode.push(FrameRecord {
+            time: frame as f32 * PERIOD,
+            links,
+            status,
+            torques,
+            goal: Some(goal),
+            distance,
+            attention: Some(attention_bytes(&weights)),
+            moving: vec![],
+        });
+    }
+    episode.event((frames / 2 + 1) as f32 * PERIOD, format!("module {unplugged} unplugged"));
+    episode.note("outcome", "goal reached");
+    episode.note("bearing", "ahead");
+    episode
+}
+
+fn recording(modules: usize) -> Recording {
+    let robot = Robot {
+        modules,
+        links_per_module: LINKS,
+        link_length: 0.5,
+        link_radius: 0.4,
+        torque_limit: 80.0,
+        metres_per_unit: 0.05,
+    };
+    let mut recording = Recording::new("Goal reaching over a simulated CAN-FD bus", "goal-reaching", robot, 1.0);
+    recording.note("bus", "CAN-FD 1M/5M");
+    recording.push(episode(modules, 110, modules * 3 / 8));
+    recording.push(episode(modules, 61, 0));
+    recording
+}
+
+/// The text of the opened page after its script ran, and how long that took.
+fn open(browser: &Path, page: &Path, hash: &str) -> String {
+    let profile = tempfile::tempdir().expect("a folder for the browser's profile");
+    let dump = profile.path().join("dom.html");
+    let mut child = Command::new(browser)
+        .args([
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--enable-unsafe-swiftshader",
+            "--disable-quic",
+            "--disable-sync",
+            "--disable-background-networking",
+            "--disable-component-update",
+            "--no-first-run",
+            "--window-size=1280,720",
+            "--virtual-time-budget=2000",
+            "--dump-dom",
+        ])
+        .arg(format!("--user-data-dir={}", profile.path().display()))
+        .arg(format!("file://{}{hash}", page.display()))
+        .stdout(fs::File::create(&dump).expect("a file for the page's text"))
+        .stderr(Stdio::null())
+        .spawn()
+        .expect("the browser starts");
+    let patience = Instant::now() + Duration::from_secs(180);
+    let status = loop {
+        if let Some(status) = child.try_wait().expect("the browser's exit status") {
+            break status;
+        }
+        if Instant::now() > patience {
+            child.kill().expect("the browser can be ended");
+            child.wait().expect("the browser ends");
+            panic!("the browser did not finish within three minutes");
+        }
+        std::thread::sleep(Duration::from_millis(50));
+    };
+    assert!(status.success(), "the browser ended with {status}");
+    fs::read_to_string(&dump).expect("the page's text")
+}
+
+fn browser() -> PathBuf {
+    let names = ["chromium", "chromium-browser", "google-chrome"];
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    let found = std::env::split_paths(&path).flat_map(|d| names.map(|n| d.join(n))).find(|p| p.is_file());
+    found.expect("no Chromium found: install it with `sudo apt-get install -y chromium`, the replay is tested in it")
+}
+
+fn attribute<'a>(dom: &'a str, name: &str) -> Option<&'a str> {
+    let element = &dom[dom.find("<html")?..];
+    let element = &element[..element.find('>')?];
+    let value = &element[element.find(&format!("{name}=\""))? + name.len() + 2..];
+    value.split('"').next()
+}
+
+#[test]
+fn the_file_needs_nothing_from_outside() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("replay.html");
+    recording(8).write_html(&path).unwrap();
+    let html = fs::read_to_string(&path).unwrap();
+    for outside in ["http:", "https:", "src=", "href=", "url(", "@import", "fetch(", "XMLHttpRequest", "import("] {
+        assert!(!html.contains(outside), "the page contains {outside}");
+    }
+    assert!(!html.contains("@RECORDING@") && !html.contains("@TITLE@"));
+    assert!(html.len() < 250_000, "{} bytes", html.len());
+}
+
+#[test]
+fn it_opens_in_a_browser() {
+    let browser = browser();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("replay.html");
+    recording(8).write_html(&path).unwrap();
+
+    let dom = open(&browser, &path, "#t=4");
+    assert_eq!(attribute(&dom, "data-error"), Some(""));
+    assert_eq!(attribute(&dom, "data-webgl"), None, "WebGL is there, but the page's shaders are refused");
+    assert_eq!(attribute(&dom, "data-ready"), Some("true"));
+    assert_eq!(attribute(&dom, "data-view"), Some("webgl2"), "drawn in 3D, by Chromium's software renderer if need be");
+    assert_eq!((attribute(&dom, "data-frames"), attribute(&dom, "data-episodes")), (Some("110"), Some("2")));
+    assert_eq!(attribute(&dom, "data-time"), Some("4.000"));
+    let body = &dom[..dom.find("id=\"recording\"").unwrap()];
+    assert!(body.contains("module 3: unplugged"), "the label in the scene");
+
+    // The other episode, without WebGL, played from its start to its end.
+    let dom = open(&browser, &path, "#episode=2&2d");
+    assert_eq!(attribute(&dom, "data-error"), Some(""));
+    assert_eq!(attribute(&dom, "data-view"), Some("2d"));
+    assert_eq!(attribute(&dom, "data-frames"), Some("61"));
+    let time: f32 = attribute(&dom, "data-time").unwrap().parse().unwrap();
+    assert!(time > 0.5, "the page plays by itself; at {time} s after 2 s");
+}
+
+#[test]
+fn robots_of_other_sizes_and_scenes_open_too() {
+    let browser = browser();
+    let folder = tempfile::tempdir().unwrap();
+    for modules in [1, 64] {
+        let mut recording = recording(modules);
+        for (outline, ghost) in [
+            (Outline::Box { half: [0.5, 4.0, 2.0] }, false),
+            (Outline::Tube { radius: 1.2, half_length: 3.0 }, false),
+            (Outline::Cylinder { radius: 0.5, half_length: 1.0 }, false),
+            (Outline::Sphere { radius: 1.0 }, true),
+        ] {
+            recording.shape(Shape { outline, pose: Pose::at([6.0, -6.0, 1.0]), ghost, moves: false });
+        }
+        let path = folder.path().join(format!("{modules}.html"));
+        recording.write_html(&path).unwrap();
+        let dom = open(&browser, &path, "#t=1");
+        assert_eq!((attribute(&dom, "data-error"), attribute(&dom, "data-ready")), (Some(""), Some("true")));
+    }
+}
