@@ -1,3 +1,17 @@
 #![no_std]
 #![forbid(unsafe_code)]
 //! The controller of one snake module, free of I/O.
+//!
+//! [`controller::Controller`] is a state machine: the board (or a simulator) feeds it the time, the sensors and one received CAN frame
+//! at a time, applies the torque it answers with, and sends the frames it offers. It allocates nothing, never panics, and does a
+//! bounded amount of work per call, whatever the bus delivers.
+//!
+//! [`neighbours`] keeps what was heard from the other modules and how fresh it is; [`failsafe`] decides when the motors relax
+//! and why.
+
+#[cfg(test)]
+extern crate std;
+
+pub mod controller;
+pub mod failsafe;
+pub mod neighbours;

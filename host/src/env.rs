@@ -6,11 +6,13 @@
 
 use std::sync::Arc;
 
+use composer_firmware::controller::relax_factor;
 use composer_shared::kinematics::Chain;
 use composer_shared::observation::{self, Sensors};
 use composer_shared::policy::GoalKnownTo;
 use composer_shared::robot::Limits;
 use composer_shared::wire;
+use composer_sim_bridge::faults::{Fault, FaultKind, ScheduledFault};
 use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -20,20 +22,6 @@ use crate::environment::{Environment, Outcome, PRIVILEGED, View};
 use crate::robot::Robot;
 use crate::sim::{Motion, Snake};
 use crate::tasks::goal_reaching::GoalReaching;
-
-/// Something wrong with one module.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum ModuleFault {
-    /// Its motors give no torque (paper: corrupted action).
-    Action,
-    /// Its sensors read zero (paper: corrupted observation).
-    Observation,
-    /// Gone from this control step on: no messages, no torque.
-    Unplugged {
-        /// The control step.
-        at: u32,
-    },
-}
 
 /// Faults that training draws for each episode.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -56,8 +44,9 @@ impl Default for FaultTraining {
 }
 
 impl FaultTraining {
-    /// Draws the faults of an episode: (module, fault).
-    fn draw(&self, rng: &mut ChaCha8Rng, modules: usize) -> Vec<(usize, ModuleFault)> {
+    /// Draws the faults of an episode.
+    pub fn draw(&self, seed: u64, modules: usize) -> Vec<ScheduledFault> {
+        let rng = &mut ChaCha8Rng::seed_from_u64(seed ^ 0xfa17);
         if rng.random::<f32>() >= self.probability || modules < 2 {
             return Vec::new();
         }
@@ -70,13 +59,16 @@ impl FaultTraining {
             pick -= w;
             pick < 0.0
         });
-        let fault = |rng: &mut ChaCha8Rng| match kind {
-            Some(0) => ModuleFault::Action,
-            Some(1) => ModuleFault::Observation,
-            // Half of them from the start: those episodes teach most about living without the module.
-            _ => ModuleFault::Unplugged { at: if rng.random() { 0 } else { rng.random_range(1..60) } },
-        };
-        order.into_iter().take(count).map(|m| (m, fault(rng))).collect()
+        let hit = order.into_iter().take(count).map(|module| {
+            let (at_ns, fault) = match kind {
+                Some(0) => (0, Fault::ActuatorDead(module)),
+                Some(1) => (0, Fault::SensorZeroed(module)),
+                // Half of them from the start: those episodes teach most about living without the module.
+                _ => (if rng.random() { 0 } else { rng.random_range(0..3_000_000_000) }, Fault::Unplug(module)),
+            };
+            ScheduledFault { at_ns, until_ns: None, fault }
+        });
+        hit.collect()
     }
 }
 
@@ -116,6 +108,45 @@ impl EnvConfig {
     }
 }
 
+/// Which modules are hit at this moment, as bit sets, and where the cable is cut.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct FaultsNow {
+    /// Unplugged.
+    pub gone: u64,
+    /// Motors dead.
+    pub weak: u64,
+    /// Sensors zeroed.
+    pub blind: u64,
+    /// The cable is cut behind this module.
+    pub cut: Option<usize>,
+}
+
+impl FaultsNow {
+    fn at(faults: &[ScheduledFault], now_ns: u64) -> Self {
+        let mut now = FaultsNow::default();
+        for scheduled in faults.iter().filter(|f| f.active(now_ns)) {
+            match scheduled.fault {
+                Fault::Unplug(m) => now.gone |= 1 << m,
+                Fault::ActuatorDead(m) => now.weak |= 1 << m,
+                Fault::SensorZeroed(m) => now.blind |= 1 << m,
+                Fault::Cut(m) => now.cut = Some(m),
+                _ => {}
+            }
+        }
+        now
+    }
+
+    /// 0 for modules on the head's side of a cut, 1 behind it.
+    fn side(&self, module: usize) -> usize {
+        usize::from(self.cut.is_some_and(|cut| module > cut))
+    }
+}
+
+/// Whether the environment can show a fault; frames lost, late or broken need a bus.
+pub fn knows_fault(kind: &FaultKind) -> bool {
+    matches!(kind, FaultKind::Unplug(_) | FaultKind::Action(_) | FaultKind::Observation(_) | FaultKind::Cut(_))
+}
+
 /// The state of one episode.
 pub struct SnakeEnv {
     config: Arc<EnvConfig>,
@@ -123,8 +154,10 @@ pub struct SnakeEnv {
     relax: f32,
     snake: Snake,
     goal: [f32; 3],
-    faults: Vec<Option<ModuleFault>>,
-    chain: Chain,
+    faults: Vec<ScheduledFault>,
+    now: FaultsNow,
+    /// What the modules before and behind a cut believe of the chain; the same without a cut.
+    chains: [Chain; 2],
     sensors: Vec<Sensors>,
     command: Vec<[f32; 2]>,
     heard: Vec<u64>,
@@ -143,10 +176,11 @@ impl SnakeEnv {
         let modules = config.robot.modules;
         let mut env = SnakeEnv {
             limits: config.robot.limits(),
-            relax: libm::expf(-config.control_period / config.robot.relax_seconds()),
+            relax: relax_factor((config.control_period * 1e6).round() as u32, config.robot.relax_seconds()),
             goal: [0.0; 3],
-            faults: vec![None; modules],
-            chain: Chain::new(config.robot.geometry()),
+            faults: Vec::new(),
+            now: FaultsNow::default(),
+            chains: [Chain::new(config.robot.geometry()), Chain::new(config.robot.geometry())],
             sensors: vec![Sensors::ZERO; modules],
             command: vec![[0.0; 2]; modules],
             heard: vec![0; modules],
@@ -164,17 +198,14 @@ impl SnakeEnv {
     }
 
     /// Starts an episode with given faults instead of drawn ones.
-    pub fn reset_with(&mut self, seed: u64, faults: &[(usize, ModuleFault)]) {
+    pub fn reset_with(&mut self, seed: u64, faults: &[ScheduledFault]) {
         let config = self.config.clone();
         self.snake = Snake::new(&config.robot);
         self.goal = config.task.goal(seed, config.robot.link_radius);
         self.rng = ChaCha8Rng::seed_from_u64(seed ^ 0x5eed_fa17);
-        self.faults.fill(None);
-        for &(module, fault) in faults {
-            self.faults[module] = Some(fault);
-        }
+        self.faults = faults.to_vec();
         self.delay = self.rng.random_range(config.delay[0]..=config.delay[1]).min(config.substeps() - 1);
-        self.chain = Chain::new(config.robot.geometry());
+        self.chains = [Chain::new(config.robot.geometry()), Chain::new(config.robot.geometry())];
         self.command.fill([0.0; 2]);
         self.steps = 0;
         self.episode_return = 0.0;
@@ -188,29 +219,29 @@ impl SnakeEnv {
         libm::sqrtf(x * x + y * y + z * z)
     }
 
-    fn gone(&self, module: usize) -> bool {
-        matches!(self.faults[module], Some(ModuleFault::Unplugged { at }) if at <= self.steps)
-    }
-
     /// Samples the sensors and lets everybody hear everybody, as one control cycle on the bus does.
     fn sample(&mut self) {
         let modules = self.config.robot.modules;
-        let mut speaking = 0u64;
+        let period_ns = f64::from(self.config.control_period) * 1e9;
+        self.now = FaultsNow::at(&self.faults, (f64::from(self.steps) * period_ns).round() as u64);
+        let mut speaking = [0u64; 2];
         for module in 0..modules {
-            self.sensors[module] = match self.faults[module] {
-                Some(ModuleFault::Observation) => Sensors::ZERO,
-                _ => self.snake.sensors(module),
-            };
-            if self.gone(module) || !self.sensors[module].plausible() {
-                self.chain.miss(module, self.relax);
-            } else {
-                speaking |= 1 << module;
-                self.chain.hear(module, &self.sensors[module].joint_angles.map(wire::quantise_angle));
+            let bit = 1u64 << module;
+            self.sensors[module] = if self.now.blind & bit != 0 { Sensors::ZERO } else { self.snake.sensors(module) };
+            let speaks = self.now.gone & bit == 0 && self.sensors[module].plausible();
+            let angles = self.sensors[module].joint_angles.map(wire::quantise_angle);
+            for (side, chain) in self.chains.iter_mut().enumerate() {
+                if speaks && (self.now.cut.is_none() || self.now.side(module) == side) {
+                    chain.hear(module, &angles);
+                    speaking[side] |= bit;
+                } else {
+                    chain.miss(module, self.relax);
+                }
             }
         }
         let missed = self.config.faults.missed_latents;
         for module in 0..modules {
-            let mut heard = speaking;
+            let mut heard = speaking[self.now.side(module)];
             if missed > 0.0 {
                 for other in 0..modules {
                     if self.rng.random::<f32>() < missed {
@@ -232,9 +263,9 @@ impl SnakeEnv {
         &self.snake
     }
 
-    /// The faults of this episode, a module each.
-    pub fn faults(&self) -> &[Option<ModuleFault>] {
-        &self.faults
+    /// The faults at this moment.
+    pub fn faults(&self) -> FaultsNow {
+        self.now
     }
 
     /// Distance of the head to the goal now.
@@ -259,8 +290,7 @@ impl Environment for SnakeEnv {
     }
 
     fn reset(&mut self, seed: u64) {
-        let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0xfa17);
-        let faults = self.config.faults.draw(&mut rng, self.config.robot.modules);
+        let faults = self.config.faults.draw(seed, self.config.robot.modules);
         self.reset_with(seed, &faults);
     }
 
@@ -273,8 +303,10 @@ impl Environment for SnakeEnv {
         // As the GOAL frame rounds it.
         let goal = wire::Goal::new(0, Some(self.snake.in_head_frame(self.goal))).position();
         for module in 0..modules {
-            let head = self.chain.head_seen_from(module);
-            let told = self.config.goal_known_to == GoalKnownTo::All || module == 0;
+            let side = self.now.side(module);
+            let head = self.chains[side].head_seen_from(module);
+            // The station that tells the goal sits at the head's end of the cable.
+            let told = side == 0 && (self.config.goal_known_to == GoalKnownTo::All || module == 0);
             let place = observation::place(module, modules);
             view.observations.push(observation::observe(
                 &self.sensors[module],
@@ -284,7 +316,7 @@ impl Environment for SnakeEnv {
             ));
             let (velocity, height) = self.snake.privileged(module);
             let true_goal = self.snake.in_own_frame(module, self.goal);
-            let fault = self.faults[module];
+            let hit = |set: u64| f32::from((set >> module & 1) as u8);
             let mut p = [0.0; PRIVILEGED];
             for axis in 0..3 {
                 p[axis] = velocity[axis] / 5.0;
@@ -292,18 +324,18 @@ impl Environment for SnakeEnv {
             }
             p[6] = height;
             p[7] = libm::logf(1.0 + self.distance);
-            p[8] = f32::from(u8::from(self.gone(module)));
-            p[9] = f32::from(u8::from(fault == Some(ModuleFault::Action)));
-            p[10] = f32::from(u8::from(fault == Some(ModuleFault::Observation)));
+            p[8] = hit(self.now.gone);
+            p[9] = hit(self.now.weak);
+            p[10] = hit(self.now.blind);
             p[11] = self.delay as f32;
             view.privileged.push(p);
-            view.acts.push(!self.gone(module));
+            view.acts.push(self.now.gone >> module & 1 == 0);
         }
     }
 
     fn step(&mut self, actions: &[[f32; 2]]) -> Outcome {
         for module in 0..self.modules() {
-            if self.gone(module) {
+            if self.now.gone >> module & 1 == 1 {
                 self.command[module] = [0.0; 2];
                 self.snake.set_torque(module, [0.0; 2]);
             } else {
@@ -317,7 +349,7 @@ impl Environment for SnakeEnv {
         for substep in 0..self.config.substeps() {
             if substep == self.delay {
                 for module in 0..self.modules() {
-                    let dead = self.faults[module] == Some(ModuleFault::Action);
+                    let dead = self.now.weak >> module & 1 == 1;
                     self.snake.set_torque(module, if dead { [0.0; 2] } else { self.command[module] });
                 }
             }
@@ -342,5 +374,96 @@ impl Environment for SnakeEnv {
             steps: self.steps,
             episode_return: self.episode_return,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn drive(env: &mut SnakeEnv, steps: usize) -> Vec<u32> {
+        let mut bits = Vec::new();
+        let mut view = View::default();
+        for step in 0..steps {
+            env.view(&mut view);
+            bits.extend(view.observations.iter().flatten().map(|v| v.to_bits()));
+            let actions: Vec<_> = (0..8).map(|m| [((step * 3 + m * 5) as f32).sin(), 0.3]).collect();
+            let outcome = env.step(&actions);
+            bits.push(outcome.reward.to_bits());
+        }
+        bits
+    }
+
+    #[test]
+    fn the_same_seed_and_actions_give_the_same_bits_after_any_history() {
+        let faults = FaultTraining { probability: 1.0, missed_latents: 0.1, ..FaultTraining::default() };
+        let config = Arc::new(EnvConfig { faults, delay: [1, 2], ..EnvConfig::new(Robot::default()) });
+        let mut fresh = SnakeEnv::new(config.clone());
+        let mut used = SnakeEnv::new(config);
+        drive(&mut used, 30);
+        fresh.reset(42);
+        used.reset(42);
+        assert_eq!(drive(&mut fresh, 60), drive(&mut used, 60));
+    }
+
+    #[test]
+    fn an_unplugged_module_falls_silent_and_slack_and_an_observation_fault_masks_the_key() {
+        let mut env = SnakeEnv::new(Arc::new(EnvConfig::new(Robot::default())));
+        let scheduled = |at_ns, fault| ScheduledFault { at_ns, until_ns: None, fault };
+        env.reset_with(1, &[scheduled(500_000_000, Fault::Unplug(3)), scheduled(0, Fault::SensorZeroed(5))]);
+        let mut view = View::default();
+        for step in 0..30 {
+            env.view(&mut view);
+            let gone = step >= 10;
+            assert_eq!(view.acts[3], !gone);
+            assert_eq!(view.heard[0] >> 3 & 1, u64::from(!gone));
+            assert_eq!(view.heard[0] >> 5 & 1, 0);
+            assert_eq!(view.observations[5], [0.0; observation::SIZE]);
+            env.step(&[[1.0, 0.0]; 8]);
+        }
+        assert_eq!(env.snake().torque(3), [0.0; 2]);
+        assert_eq!(env.snake().torque(2), [80.0, 0.0]);
+    }
+
+    #[test]
+    fn a_cut_cable_makes_two_groups_and_a_replugged_module_comes_back() {
+        let mut env = SnakeEnv::new(Arc::new(EnvConfig::new(Robot::default())));
+        env.reset_with(
+            1,
+            &[
+                ScheduledFault { at_ns: 100_000_000, until_ns: None, fault: Fault::Cut(2) },
+                ScheduledFault { at_ns: 0, until_ns: Some(300_000_000), fault: Fault::Unplug(6) },
+            ],
+        );
+        let mut view = View::default();
+        for step in 0..10 {
+            env.view(&mut view);
+            let here = if step >= 6 { 0xff } else { 0xbf };
+            assert_eq!(view.heard[1], if step >= 2 { 0b111 } else { here }, "step {step}");
+            assert_eq!(view.heard[4], if step >= 2 { here & 0xf8 } else { here }, "step {step}");
+            assert_eq!(view.observations[4][7], if step >= 2 { 0.0 } else { 1.0 });
+            env.step(&[[0.5, 0.0]; 8]);
+        }
+    }
+
+    #[test]
+    fn only_the_head_is_told_when_only_the_head_knows() {
+        let config = EnvConfig { goal_known_to: GoalKnownTo::Head, ..EnvConfig::new(Robot::default()) };
+        let env = SnakeEnv::new(Arc::new(config));
+        let mut view = View::default();
+        env.view(&mut view);
+        assert_eq!(view.observations[0][7], 1.0);
+        assert!(view.observations[1..].iter().all(|o| o[..8].iter().all(|v| *v == 0.0)));
+    }
+
+    #[test]
+    fn an_episode_is_cut_at_the_cap_and_ends_at_the_goal() {
+        let mut config = EnvConfig::new(Robot::default());
+        config.task.cap = 3;
+        let mut env = SnakeEnv::new(Arc::new(config));
+        let still = [[0.0; 2]; 8];
+        assert!(!env.step(&still).truncated && !env.step(&still).truncated);
+        let last = env.step(&still);
+        assert!(last.truncated && !last.terminated && (last.distance - 17.5).abs() < 7.6);
     }
 }

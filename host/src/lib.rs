@@ -2,6 +2,10 @@
 
 pub mod env;
 pub mod environment;
+pub mod eval;
+pub mod freeze;
+pub mod network;
 pub mod robot;
+pub mod sil;
 pub mod sim;
 pub mod tasks;

@@ -132,7 +132,10 @@ impl Robot {
             return invalid(format!("modules = {}; a bus carries 1 to {MAX_MODULES}", self.modules));
         }
         if !(2..=MAX_JOINTS).contains(&self.links_per_module) {
-            return invalid(format!("links_per_module = {}; 2 to {MAX_JOINTS} fit a STATE frame", self.links_per_module));
+            return invalid(format!(
+                "links_per_module = {}; 2 to {MAX_JOINTS} fit a STATE frame",
+                self.links_per_module
+            ));
         }
         let positive = [
             ("link_length", self.link_length),

@@ -1,10 +1,10 @@
 //! The frozen policy: a binary image of the integer network with all that a module must know to run it, read in place.
 //!
-//! `policy-format.md` beside this crate's manifest specifies every byte. [`Policy::parse`] checks an image once; afterwards nothing can fail.
-//! [`ImageWriter`] is the other direction.
+//! `policy-format.md` beside this crate's manifest specifies every byte. [`Policy::parse`] checks an image once;
+//! afterwards nothing can fail. [`ImageWriter`] is the other direction.
 //!
-//! The network (paper, section "Method"; all modules share it) maps the observation x of a module to its latent message (k, v), and its own latent with
-//! those it heard to its two torques:
+//! The network (paper, section "Method"; all modules share it) maps the observation x of a module to its latent message
+//! (k, v), and its own latent with those it heard to its two torques:
 //!
 //! ```text
 //! z = clip((x - mean) / std, -5, 5)          e = tanh(W_enc z + b_enc)
@@ -37,7 +37,7 @@ pub const VALUE: usize = 32;
 pub const HIDDEN: usize = 64;
 /// Width of the action: yaw and pitch torque.
 pub const OUT: usize = AXES;
-/// Inputs of the hidden layer: embedding, then context.
+/// Inputs of the hidden layer, embedding and context together.
 pub const HIDDEN_IN: usize = EMBED + VALUE;
 /// Normalised observations are clipped to plus and minus this.
 pub const CLIP: f32 = 5.0;
@@ -245,15 +245,17 @@ impl fmt::Display for PolicyError {
             Self::Length { stated } => {
                 write!(f, "the policy image says it is {stated} bytes long, layout version {VERSION} is {IMAGE_SIZE}")
             }
-            Self::Checksum { stored, computed } => write!(
-                f,
-                "the policy image is damaged: its CRC-32 should be {stored:08x} and is {computed:08x}"
-            ),
+            Self::Checksum { stored, computed } => {
+                write!(f, "the policy image is damaged: its CRC-32 should be {stored:08x} and is {computed:08x}")
+            }
             Self::Task(found) => {
                 write!(f, "the policy image is for task {found}, this build knows tasks 0 to {}", Task::ALL.len() - 1)
             }
             Self::Flag { field, found } => {
-                write!(f, "the policy image has {found} in field `{field}`, which layout version {VERSION} does not define")
+                write!(
+                    f,
+                    "the policy image has {found} in field `{field}`, which layout version {VERSION} does not define"
+                )
             }
             Self::Value { field, range } => {
                 write!(f, "the policy image has a {field} that is not a number from {range}")
@@ -275,23 +277,27 @@ pub enum Layer {
     Key,
     /// Embedding to value, no bias.
     Value,
-    /// Embedding and context to hidden, then tanh.
+    /// Embedding to hidden.
     Hidden,
+    /// Context to hidden, no bias: the sum of both goes through tanh. Apart from [`Layer::Hidden`] because embedding
+    /// and context differ in size, so that a common scale of the weights would cost one of them bits. All zero without
+    /// attention.
+    Context,
     /// Hidden to action.
     Output,
 }
 
 impl Layer {
     /// All layers in the order of the image.
-    pub const ALL: [Layer; 6] =
-        [Layer::Encoder, Layer::Query, Layer::Key, Layer::Value, Layer::Hidden, Layer::Output];
+    pub const ALL: [Layer; 7] =
+        [Layer::Encoder, Layer::Query, Layer::Key, Layer::Value, Layer::Hidden, Layer::Context, Layer::Output];
 
     /// Numbers that go in.
     pub const fn inputs(self) -> usize {
         match self {
             Layer::Encoder => OBS,
-            Layer::Query | Layer::Key | Layer::Value => EMBED,
-            Layer::Hidden => HIDDEN_IN,
+            Layer::Query | Layer::Key | Layer::Value | Layer::Hidden => EMBED,
+            Layer::Context => VALUE,
             Layer::Output => HIDDEN,
         }
     }
@@ -302,7 +308,7 @@ impl Layer {
             Layer::Encoder => EMBED,
             Layer::Query | Layer::Key => KEY,
             Layer::Value => VALUE,
-            Layer::Hidden => HIDDEN,
+            Layer::Hidden | Layer::Context => HIDDEN,
             Layer::Output => OUT,
         }
     }
@@ -395,15 +401,18 @@ pub struct Policy<'a> {
     query: Dense<'a, EMBED, KEY>,
     key: Dense<'a, EMBED, KEY>,
     value: Dense<'a, EMBED, VALUE>,
-    hidden: Dense<'a, HIDDEN_IN, HIDDEN>,
+    hidden: Dense<'a, EMBED, HIDDEN>,
+    context: Dense<'a, VALUE, HIDDEN>,
     output: Dense<'a, HIDDEN, OUT>,
 }
 
 impl<'a> Policy<'a> {
-    /// Checks an image and gives a view into it. The slice must be exactly [`IMAGE_SIZE`] long; it may lie at any address.
+    /// Checks an image and gives a view into it. The slice must be exactly [`IMAGE_SIZE`] long; it may lie at any
+    /// address.
     pub fn parse(image: &'a [u8]) -> Result<Self, PolicyError> {
         let too_short = PolicyError::TooShort { length: image.len() };
-        // What a foreign or older file says about itself comes before its length, so that the reason given is the true one.
+        // What a foreign or older file says about itself comes before its length, so that the reason given is the true
+        // one.
         let (magic, rest) = image.split_first_chunk::<8>().ok_or(too_short)?;
         if *magic != MAGIC {
             return Err(PolicyError::Magic);
@@ -506,6 +515,7 @@ impl<'a> Policy<'a> {
             key: dense(image, Layer::Key)?,
             value: dense(image, Layer::Value)?,
             hidden: dense(image, Layer::Hidden)?,
+            context: dense(image, Layer::Context)?,
             output: dense(image, Layer::Output)?,
         }))
     }
@@ -560,14 +570,16 @@ impl<'a> Policy<'a> {
         self.crc
     }
 
-    /// The low 16 bits of the CRC-32. It travels in every LATENT, so that modules with different policies ignore each other.
+    /// The low 16 bits of the CRC-32. It travels in every LATENT, so that modules with different policies ignore each
+    /// other.
     pub fn tag(&self) -> u16 {
         self.crc as u16
     }
 
     /// From the observation of a module to its embedding, query and latent message.
     ///
-    /// Values outside of five standard deviations saturate there, infinite ones too; what is not a number counts as -5 to 5's middle, the mean.
+    /// Values more than five standard deviations from the mean saturate there, infinite ones too; what is not a number
+    /// counts as the mean.
     pub fn encode(&self, observation: &Observation) -> Encoded {
         let mut input = [0; OBS];
         for ((x, value), (mean, gain)) in input.iter_mut().zip(observation).zip(self.mean.iter().zip(self.gain)) {
@@ -589,9 +601,10 @@ impl<'a> Policy<'a> {
 
     /// The action of a module, yaw and pitch torque as a fraction of the limit, each within -1 to 1.
     ///
-    /// `own` is what [`Policy::encode`] gave. Bit `j` of `heard` says that `latents[j]` is the message of module `j` for this control cycle; the
-    /// own message is always part of it and taken from `own`, whatever `heard` and `latents` say at `own_index`. An index beyond the last counts as the
-    /// last. `attention` receives the weight of each module in Q15 (32767 is 1), together about 32767; a policy without attention puts all of it on itself.
+    /// `own` is what [`Policy::encode`] gave. Bit `j` of `heard` says that `latents[j]` is the message of module `j`
+    /// for this control cycle; the own message is always part of it and taken from `own`, whatever `heard` and
+    /// `latents` say at `own_index`. An index beyond the last counts as the last. `attention` receives the weight of
+    /// each module in Q15 (32767 is 1), together about 32767; a policy without attention puts all of it on itself.
     pub fn act(
         &self,
         own: &Encoded,
@@ -602,15 +615,10 @@ impl<'a> Policy<'a> {
     ) -> [f32; AXES] {
         let own_index = own_index.min(MAX_MODULES - 1);
         let own_bit = 1u64 << own_index;
-        let mut input = [0; HIDDEN_IN];
-        let (embedding, context) = input.split_at_mut(EMBED);
-        for (x, value) in embedding.iter_mut().zip(own.embedding) {
-            *x = value;
-        }
+        let mut hidden = self.hidden.forward(&own.embedding);
         if self.meta.attention {
             let mask = heard | own_bit;
-            let latent =
-                |j: usize| if j == own_index { &own.latent } else { latents.get(j).unwrap_or(&Latent::ZERO) };
+            let latent = |j: usize| if j == own_index { &own.latent } else { latents.get(j).unwrap_or(&Latent::ZERO) };
             let mut logits = [0; MAX_MODULES];
             for j in nn::ones(mask) {
                 if let Some(logit) = logits.get_mut(j) {
@@ -626,8 +634,9 @@ impl<'a> Policy<'a> {
                     *sum += weight * i32::from(value);
                 }
             }
-            for (x, sum) in context.iter_mut().zip(sums) {
-                *x = nn::saturate16((sum + (1 << (CONTEXT_SHIFT - 1))) >> CONTEXT_SHIFT);
+            let context = sums.map(|sum| nn::saturate16((sum + (1 << (CONTEXT_SHIFT - 1))) >> CONTEXT_SHIFT));
+            for (sum, more) in hidden.iter_mut().zip(self.context.forward(&context)) {
+                *sum = sum.saturating_add(more);
             }
             if let Some(attention) = attention {
                 *attention = weights;
@@ -638,12 +647,12 @@ impl<'a> Policy<'a> {
                 *weight = nn::ONE as u16;
             }
         }
-        let hidden = self.hidden.forward(&input).map(nn::tanh);
-        self.output.forward(&hidden).map(|action| f32::from(nn::saturate16(action)) / f32::from(nn::ONE))
+        self.output.forward(&hidden.map(nn::tanh)).map(|action| f32::from(nn::saturate16(action)) / f32::from(nn::ONE))
     }
 }
 
-/// The context is the weighted sum of values (Q15 weights times int8), shifted right by this: int8 value 1 becomes about 256.
+/// The context is the weighted sum of values (Q15 weights times int8), shifted right by this: int8 value 1 becomes
+/// about 256.
 pub const CONTEXT_SHIFT: u32 = 7;
 
 /// |result| <= 16 * 32767 * 128, below 2^27.
@@ -699,7 +708,8 @@ fn dense<const IN: usize, const OUT: usize>(image: &[u8], layer: Layer) -> Optio
     })
 }
 
-/// Writes an image; every part that is not written stays zero. [`ImageWriter::finish`] checks the numbers and adds the checksum.
+/// Writes an image; every part that is not written stays zero. [`ImageWriter::finish`] checks the numbers and adds the
+/// checksum.
 pub struct ImageWriter<'a> {
     image: &'a mut [u8; IMAGE_SIZE],
     error: Option<PolicyError>,
@@ -757,7 +767,8 @@ impl<'a> ImageWriter<'a> {
         self.put(layer.offset(), &u32::from(shift).to_le_bytes());
     }
 
-    /// One output of a layer. The bias of a layer without one is ignored, as are an output and weights that the layer does not have.
+    /// One output of a layer. The bias of a layer without one is ignored, as are an output and weights that the layer
+    /// does not have.
     pub fn row(&mut self, layer: Layer, output: usize, multiplier: i32, bias: i32, weights: &[i8]) {
         if output >= layer.outputs() {
             return;
@@ -802,8 +813,8 @@ fn seal(image: &mut [u8; IMAGE_SIZE]) {
     }
 }
 
-/// An untrained policy with weights drawn from `seed`, for tests: activations of about the size that trained networks have, paper's
-/// robot, control period 50 ms, with attention.
+/// An untrained policy with weights drawn from `seed`, for tests: activations of about the size that trained networks
+/// have, paper's robot, control period 50 ms, with attention.
 pub fn random_image(seed: u32, image: &mut [u8; IMAGE_SIZE]) {
     let meta = Meta {
         task: Task::GoalReaching,
@@ -830,17 +841,18 @@ pub fn random_image(seed: u32, image: &mut [u8; IMAGE_SIZE]) {
     // Logits differ by about two, in natural units.
     writer.softmax(1 << 27, 30);
     for layer in Layer::ALL {
-        // Shifts such that sums of random terms come out near 1 in the fixed point of the result: Q16, int16, int8, int8, Q16, Q15.
+        // Shifts such that sums of random terms come out near 1 in the fixed point of the result: Q16, int16, int8,
+        // int8, Q16, Q15.
         let (multiplier, shift) = match layer {
             Layer::Encoder => (1 << 25, 30),
             Layer::Query => (1 << 20, 30),
             Layer::Key | Layer::Value => (1 << 20, 38),
-            Layer::Hidden => (1 << 23, 30),
+            Layer::Hidden | Layer::Context => (1 << 23, 30),
             Layer::Output => (1 << 20, 30),
         };
         writer.shift(layer, shift);
         for output in 0..layer.outputs() {
-            let mut weights = [0; HIDDEN_IN];
+            let mut weights = [0; EMBED];
             weights.fill_with(|| next().max(-127));
             let bias = i32::from(next()) << 6;
             writer.row(layer, output, multiplier, bias, &weights);
@@ -848,4 +860,368 @@ pub fn random_image(seed: u32, image: &mut [u8; IMAGE_SIZE]) {
     }
     // Its numbers are constants within range.
     let _ = writer.finish();
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use std::boxed::Box;
+    use std::string::{String, ToString};
+    use std::vec::Vec;
+
+    fn random(seed: u32) -> Box<[u8; IMAGE_SIZE]> {
+        let mut image = Box::new([0; IMAGE_SIZE]);
+        random_image(seed, &mut image);
+        image
+    }
+
+    /// Observations of eight modules, from integers alone.
+    fn observations(seed: u32) -> [Observation; 8] {
+        let mut state = seed.wrapping_mul(2_654_435_761) | 1;
+        core::array::from_fn(|_| {
+            core::array::from_fn(|_| {
+                state ^= state << 13;
+                state ^= state >> 17;
+                state ^= state << 5;
+                (state >> 16) as f32 / 16384.0 - 2.0
+            })
+        })
+    }
+
+    fn encode_all(policy: &Policy, observations: &[Observation; 8]) -> ([Encoded; 8], [Latent; MAX_MODULES]) {
+        let encoded = observations.each_ref().map(|o| policy.encode(o));
+        let mut latents = [Latent::ZERO; MAX_MODULES];
+        latents.iter_mut().zip(&encoded).for_each(|(to, from)| *to = from.latent);
+        (encoded, latents)
+    }
+
+    #[test]
+    fn a_written_image_reads_back() {
+        let image = random(1);
+        let policy = Policy::parse(&image[..]).unwrap();
+        assert_eq!(policy.task(), Task::GoalReaching);
+        assert_eq!(policy.geometry(), Geometry::default());
+        assert_eq!(policy.limits(), Limits::default());
+        assert_eq!((policy.control_period_us(), policy.relax_seconds()), (50_000, 0.25));
+        assert_eq!(u32::from(policy.tag()), policy.crc() & 0xffff);
+        assert_ne!(policy.tag(), Policy::parse(&random(2)[..]).unwrap().tag());
+
+        let meta = Meta {
+            task: Task::WallClimbing,
+            goal_known_to: GoalKnownTo::Head,
+            attention: false,
+            trained_with_faults: true,
+            geometry: Geometry { links_per_module: 3, link_length: 0.25 },
+            limits: Limits { torque: 1.0, torque_slew: 2.0, joint_angle: 3.0, joint_speed: 4.0, temperature: 5.0 },
+            control_period_us: 12_345,
+            relax_seconds: 0.5,
+        };
+        let mut image = Box::new([0; IMAGE_SIZE]);
+        let mut writer = ImageWriter::new(&meta, &mut image);
+        writer.input(3, 1.5, 2.5);
+        writer.shift(Layer::Output, 9);
+        writer.row(Layer::Output, 1, -7, 77, &[-5; HIDDEN]);
+        writer.row(Layer::Value, 31, 3, 99, &[6; EMBED]);
+        writer.finish().unwrap();
+        let policy = Policy::parse(&image[..]).unwrap();
+        assert_eq!(policy.meta(), meta);
+        assert_eq!((f32::from_le_bytes(policy.mean[3]), f32::from_le_bytes(policy.gain[3])), (1.5, 2.5));
+        assert_eq!((policy.output.shift, policy.output.weights[1]), (9, [0xfb; HIDDEN]));
+        assert_eq!(policy.output.multipliers[1], (-7i32).to_le_bytes());
+        assert_eq!(policy.output.bias.unwrap()[1], 77i32.to_le_bytes());
+        assert_eq!((policy.value.weights[31], policy.value.weights[30]), ([6; EMBED], [0; EMBED]));
+        assert!(policy.value.bias.is_none());
+    }
+
+    #[test]
+    fn the_layout_is_the_documented_one() {
+        assert_eq!(Layer::ALL.map(Layer::offset), [296, 2604, 3696, 4788, 6968, 11580, 13888]);
+        assert_eq!((IMAGE_SIZE, MEAN_AT, SOFTMAX_AT, CRC_AT), (14040, 64, 288, 14036));
+        assert_eq!(CRC.checksum(b"123456789"), 0xcbf4_3926);
+        let document = include_str!("../policy-format.md");
+        for layer in Layer::ALL {
+            let (outputs, inputs, multipliers) = (layer.outputs(), layer.inputs(), layer.offset() + 4);
+            let after = multipliers + 4 * outputs;
+            let (biases, weights) =
+                if layer.has_bias() { (after.to_string(), after + 4 * outputs) } else { ("-".into(), after) };
+            let name = std::format!("{layer:?}").to_lowercase();
+            let row = std::format!(
+                "| {} | {name} | {outputs} x {inputs} | {multipliers} | {biases} | {weights} |",
+                layer.offset()
+            );
+            assert!(document.contains(&row), "{row}");
+        }
+        for (at, field) in [
+            (TASK_AT, "u8 | task"),
+            (GOAL_KNOWN_TO_AT, "u8 | goal known to"),
+            (LENGTH_AT, "u32 | length"),
+            (DIMENSIONS_AT, "u16[6] | dimensions"),
+            (ATTENTION_AT, "u8 | attention"),
+            (FAULTS_AT, "u8 | trained with faults"),
+            (LINKS_AT, "u8 | links per module"),
+            (LINK_LENGTH_AT, "f32 | link length"),
+            (LIMITS_AT, "f32 | torque limit"),
+            (PERIOD_AT, "u32 | control period"),
+            (RELAX_AT, "f32 | relaxation time"),
+            (MEAN_AT, "f32[28] | mean"),
+            (GAIN_AT, "f32[28] | gain"),
+            (SOFTMAX_AT, "i32 | softmax multiplier"),
+            (CRC_AT, "u32 | checksum"),
+        ] {
+            assert!(document.contains(&std::format!("| {at} | {field} |")), "{field}");
+        }
+    }
+
+    #[test]
+    fn every_damage_is_refused() {
+        let mut image = random(3);
+        for byte in 0..IMAGE_SIZE {
+            // All bits of header and checksum; of the bulk between, one bit a byte.
+            let all = byte < LAYERS_AT || byte >= CRC_AT;
+            for bit in (0..8).filter(|bit| all || byte % 8 == *bit) {
+                image[byte] ^= 1 << bit;
+                assert!(Policy::parse(&image[..]).is_err(), "byte {byte} bit {bit}");
+                image[byte] ^= 1 << bit;
+            }
+        }
+        for length in 0..IMAGE_SIZE {
+            assert_eq!(Policy::parse(&image[..length]).unwrap_err(), PolicyError::TooShort { length });
+        }
+        assert!(Policy::parse(&image[..]).is_ok());
+    }
+
+    #[test]
+    fn each_reason_is_one_clear_sentence() {
+        let said = |at: usize, bytes: &[u8]| -> String {
+            let mut image = random(4);
+            image[at..at + bytes.len()].copy_from_slice(bytes);
+            seal(&mut image);
+            Policy::parse(&image[..]).unwrap_err().to_string()
+        };
+        assert_eq!(said(0, b"ELF"), "this is not a policy image: it does not begin with COMPOSER");
+        assert_eq!(
+            said(VERSION_AT, &[2]),
+            "the policy image has layout version 2, this build reads version 1: export the policy again"
+        );
+        assert!(
+            said(DIMENSIONS_AT + 2, &[128]).contains("dimensions [28, 128, 16, 32, 64, 2], this build runs [28, 64")
+        );
+        assert_eq!(said(LENGTH_AT, &[0, 0]), "the policy image says it is 0 bytes long, layout version 1 is 14040");
+        assert_eq!(said(TASK_AT, &[5]), "the policy image is for task 5, this build knows tasks 0 to 4");
+        assert!(said(GOAL_KNOWN_TO_AT, &[2]).contains("2 in field `goal known to`"));
+        assert!(said(ATTENTION_AT, &[2]).contains("`attention`"));
+        assert!(said(FAULTS_AT, &[2]).contains("`trained with faults`"));
+        assert!(said(RESERVED_AT, &[1]).contains("`reserved`"));
+        let (nan, infinite) = (f32::NAN.to_le_bytes(), f32::INFINITY.to_le_bytes());
+        assert!(said(LINKS_AT, &[5]).contains("links per module that is not a number from 2 to 4"));
+        for (at, field) in [
+            (LINK_LENGTH_AT, "link length"),
+            (LIMITS_AT, "torque limit"),
+            (LIMITS_AT + 4, "torque slew limit"),
+            (LIMITS_AT + 8, "joint angle limit"),
+            (LIMITS_AT + 12, "joint speed limit"),
+            (LIMITS_AT + 16, "temperature limit"),
+            (RELAX_AT, "relaxation time"),
+            (MEAN_AT + 4 * 27, "input mean"),
+            (GAIN_AT + 4 * 27, "input gain"),
+        ] {
+            assert!(said(at, &nan).contains(field) && said(at, &infinite).contains(field), "{field}");
+        }
+        assert!(said(PERIOD_AT, &[0; 4]).contains("control period that is not a number from 1000 to"));
+        assert!(said(SOFTMAX_AT + 3, &[0x80]).contains("softmax multiplier"));
+        assert!(said(SOFTMAX_AT + 4, &[0]).contains("shift that is not a number from 1 to 62"));
+        assert!(said(Layer::Context.offset(), &[63]).contains("shift"));
+
+        let mut image = random(4);
+        image[5000] ^= 4;
+        assert!(
+            Policy::parse(&image[..]).unwrap_err().to_string().starts_with("the policy image is damaged: its CRC-32")
+        );
+        let cut = Policy::parse(&image[..9000]).unwrap_err().to_string();
+        assert_eq!(cut, "the policy image is cut short: it has 9000 bytes where 14040 are needed");
+        let long: Vec<u8> = image.iter().copied().chain([0]).collect();
+        assert!(Policy::parse(&long).unwrap_err().to_string().contains("too long"));
+    }
+
+    #[test]
+    fn the_writer_refuses_what_the_reader_would() {
+        let mut image = Box::new([0; IMAGE_SIZE]);
+        let good = Policy::parse(&random(1)[..]).unwrap().meta();
+        let relax = Meta { relax_seconds: -1.0, ..good };
+        assert!(ImageWriter::new(&relax, &mut image).finish().is_err());
+        let mut writer = ImageWriter::new(&good, &mut image);
+        writer.input(0, f32::NAN, 1.0);
+        writer.input(1, 0.0, 1.0);
+        assert!(writer.finish().is_err());
+        assert!(Policy::parse(&image[..]).is_err());
+        let mut writer = ImageWriter::new(&good, &mut image);
+        writer.softmax(-1, 5);
+        assert!(writer.finish().is_err());
+        let mut writer = ImageWriter::new(&good, &mut image);
+        writer.shift(Layer::Key, 0);
+        assert!(writer.finish().is_err());
+        // What does not exist is ignored.
+        let mut writer = ImageWriter::new(&good, &mut image);
+        writer.input(OBS, f32::NAN, 0.0);
+        writer.row(Layer::Output, OUT, 1, 1, &[1; 200]);
+        writer.finish().unwrap();
+        assert!(Policy::parse(&image[..]).is_ok());
+    }
+
+    #[test]
+    fn names_round_trip() {
+        for task in Task::ALL {
+            assert_eq!(Task::from_name(task.name()), Some(task));
+        }
+        assert_eq!((Task::from_name("dancing"), GoalKnownTo::from_name("head")), (None, Some(GoalKnownTo::Head)));
+        assert_eq!((GoalKnownTo::from_name("tail"), GoalKnownTo::All.to_string().as_str()), (None, "all"));
+    }
+
+    /// Pins the bits: other targets run the same test, and a kernel that is made faster must still pass it.
+    #[test]
+    fn the_bits_are_pinned() {
+        let image = random(7);
+        let policy = Policy::parse(&image[..]).unwrap();
+        let (encoded, latents) = encode_all(&policy, &observations(7));
+        let mut digest = CRC.digest();
+        for (i, own) in encoded.iter().enumerate() {
+            own.latent.key.iter().chain(&own.latent.value).for_each(|x| digest.update(&x.to_le_bytes()));
+            let mut attention = [0; MAX_MODULES];
+            let action = policy.act(own, &latents, 0xdb, Some(&mut attention), i);
+            attention.iter().for_each(|x| digest.update(&x.to_le_bytes()));
+            action.iter().for_each(|x| digest.update(&x.to_bits().to_le_bytes()));
+        }
+        assert_eq!((policy.crc(), digest.finalize()), (2_459_611_591, 3_204_140_105));
+    }
+
+    #[test]
+    fn random_policies_are_alive() {
+        let mut largest = 0.0f32;
+        for seed in 0..20 {
+            let image = random(seed);
+            let policy = Policy::parse(&image[..]).unwrap();
+            let (encoded, latents) = encode_all(&policy, &observations(seed));
+            let actions = core::array::from_fn::<_, 8, _>(|i| policy.act(&encoded[i], &latents, 0xff, None, i));
+            assert!(actions.iter().any(|a| *a != actions[0]));
+            let saturated = encoded.iter().flat_map(|e| e.embedding).filter(|e| e.abs() == nn::ONE).count();
+            assert!(saturated < 50, "{saturated} of 512");
+            let mut attention = [0; MAX_MODULES];
+            policy.act(&encoded[0], &latents, 0xff, Some(&mut attention), 0);
+            largest = actions.as_flattened().iter().fold(largest, |m, a| m.max(a.abs()));
+            assert!(attention[..8].iter().max() > attention[..8].iter().min());
+        }
+        assert!(largest > 0.3, "{largest}");
+    }
+
+    #[test]
+    fn nonsense_in_an_observation_becomes_something_finite() {
+        let image = random(8);
+        let policy = Policy::parse(&image[..]).unwrap();
+        let nan = policy.encode(&[f32::NAN; OBS]);
+        assert_eq!(nan, policy.encode(&[0.0; OBS]), "the means are 0");
+        assert_eq!(policy.encode(&[f32::INFINITY; OBS]), policy.encode(&[5.0; OBS]));
+        assert_eq!(policy.encode(&[f32::NEG_INFINITY; OBS]), policy.encode(&[-1e9; OBS]));
+        let action = policy.act(&nan, &[Latent::ZERO; MAX_MODULES], u64::MAX, None, usize::MAX);
+        assert!(action.iter().all(|a| a.is_finite()));
+    }
+
+    #[test]
+    fn without_attention_the_others_do_not_matter() {
+        let mut image = random(9);
+        image[ATTENTION_AT] = 0;
+        seal(&mut image);
+        let policy = Policy::parse(&image[..]).unwrap();
+        let (encoded, latents) = encode_all(&policy, &observations(9));
+        assert_eq!(encoded[0].latent, Latent::ZERO);
+        let mut attention = [1; MAX_MODULES];
+        let action = policy.act(&encoded[2], &latents, 0xff, Some(&mut attention), 2);
+        assert_eq!(action, policy.act(&encoded[2], &[Latent { key: [9; 16], value: [9; 32] }; 64], 0, None, 2));
+        assert_eq!(attention, core::array::from_fn(|j| if j == 2 { 32767 } else { 0 }));
+    }
+
+    fn latents() -> impl Strategy<Value = [Latent; MAX_MODULES]> {
+        any::<u64>().prop_map(|seed| {
+            let mut state = seed;
+            let mut next = move || {
+                state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+                (state >> 56) as i8
+            };
+            core::array::from_fn(|_| Latent {
+                key: core::array::from_fn(|_| next()),
+                value: core::array::from_fn(|_| next()),
+            })
+        })
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
+
+        #[test]
+        fn parsing_never_panics(bytes in proptest::collection::vec(any::<u8>(), 0..400), keep in 0usize..200) {
+            prop_assert!(Policy::parse(&bytes).is_err());
+            let mut image = random(1);
+            let end = (keep + bytes.len()).min(IMAGE_SIZE);
+            image[keep..end].copy_from_slice(&bytes[..end - keep]);
+            let _ = Policy::parse(&image[..]);
+        }
+
+        /// Whatever numbers an image holds: if it is accepted, it runs (overflow traps in debug builds).
+        #[test]
+        fn an_accepted_image_never_panics(seed in any::<u64>(), others in latents(), heard in any::<u64>()) {
+            let mut image = random(1);
+            let mut state = seed | 1;
+            for at in SOFTMAX_AT..CRC_AT {
+                state ^= state << 13;
+                state ^= state >> 7;
+                state ^= state << 17;
+                image[at] = if seed % 3 == 0 { [0x80, 0x7f][(state & 1) as usize] } else { state as u8 };
+            }
+            image[SOFTMAX_AT + 3] &= 0x7f;
+            for at in Layer::ALL.map(Layer::offset).into_iter().chain([SOFTMAX_AT + 4]) {
+                state = state.rotate_left(17).wrapping_mul(5);
+                let shift = 1 + (state % 62) as u32;
+                image[at..at + 4].copy_from_slice(&shift.to_le_bytes());
+            }
+            seal(&mut image);
+            let policy = Policy::parse(&image[..]).unwrap();
+            let own = policy.encode(&observations(seed as u32)[0]);
+            let action = policy.act(&own, &others, heard, None, seed as usize % 70);
+            prop_assert!(action.iter().all(|a| a.abs() <= 1.0));
+        }
+
+        #[test]
+        fn neighbours_have_no_order_and_the_masked_no_say(
+            seed in 0u32..50, mut others in latents(), heard in any::<u64>(), own_index in 0usize..64, turn in 1u32..64,
+        ) {
+            let image = random(seed);
+            let policy = Policy::parse(&image[..]).unwrap();
+            let own = policy.encode(&observations(seed)[0]);
+            let mut attention = [7; MAX_MODULES];
+            let action = policy.act(&own, &others, heard, Some(&mut attention), own_index);
+            prop_assert_eq!(policy.act(&own, &others, heard, None, own_index), action);
+
+            let mask = heard | 1 << own_index;
+            let total: i32 = attention.iter().map(|w| i32::from(*w)).sum();
+            prop_assert!((total - 32767).abs() <= 32, "{}", total);
+            prop_assert!((0..64).all(|j| mask >> j & 1 == 1 || attention[j] == 0));
+
+            // Everybody moves to another slot.
+            let mut turned = others;
+            turned.rotate_right(turn as usize);
+            let moved = (own_index + turn as usize) % 64;
+            prop_assert_eq!(policy.act(&own, &turned, heard.rotate_left(turn), None, moved), action);
+
+            // Who is not heard, and what lies in the own slot, does not count.
+            for (j, latent) in others.iter_mut().enumerate() {
+                if j == own_index || mask >> j & 1 == 0 {
+                    *latent = Latent { key: [127; KEY], value: [-128; VALUE] };
+                }
+            }
+            prop_assert_eq!(policy.act(&own, &others, heard, None, own_index), action);
+            prop_assert_eq!(policy.act(&own, &others, mask, None, own_index), action);
+            let alone = policy.act(&own, &others, 0, None, own_index);
+            prop_assert_eq!(policy.act(&own, &others, 1 << own_index, None, own_index), alone);
+        }
+    }
 }

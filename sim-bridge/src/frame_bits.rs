@@ -133,11 +133,7 @@ pub fn worst_case(format: Format, len: usize) -> Length {
 }
 
 fn split(format: Format, nominal: u32, fast: u32) -> Length {
-    if format == Format::FdBrs {
-        Length { nominal, data: fast }
-    } else {
-        Length { nominal: nominal + fast, data: 0 }
-    }
+    if format == Format::FdBrs { Length { nominal, data: fast } } else { Length { nominal: nominal + fast, data: 0 } }
 }
 
 /// State of the stuffing rule after a bit: value of the last bit on the wire (bit 2) and length of its run minus one (bits 0 and 1).
@@ -232,20 +228,6 @@ impl Counter {
     }
 }
 
-/// Code for the number of data bytes: 0 to 8, then 12, 16, 20, 24, 32, 48, 64.
-fn dlc(len: usize) -> u32 {
-    match len {
-        0..=8 => len as u32,
-        9..=12 => 9,
-        13..=16 => 10,
-        17..=20 => 11,
-        21..=24 => 12,
-        25..=32 => 13,
-        33..=48 => 14,
-        _ => 15,
-    }
-}
-
 /// Actual length of `frame`, stuff bits counted from its bits. Costs well below a microsecond.
 pub fn length(frame: &Frame) -> Length {
     let payload = frame.payload();
@@ -255,7 +237,7 @@ pub fn length(frame: &Frame) -> Length {
     let id = u32::from(frame.id & 0x7ff);
     if format == Format::Classic {
         // RTR, IDE and FDF are dominant.
-        let header = id << 7 | dlc(payload.len());
+        let header = id << 7 | u32::from(frame.dlc());
         count.bits(header, CLASSIC_HEADER - 1);
         let mut crc = (0..CLASSIC_HEADER - 1).rev().fold(0, |crc, k| crc_step(crc, header >> k & 1 == 1, 15, CRC15));
         for &byte in payload {
@@ -269,7 +251,7 @@ pub fn length(frame: &Frame) -> Length {
     // RRS 0, IDE 0, FDF 1, res 0, BRS.
     count.bits(id << 5 | 0b00100 | u32::from(frame.brs), FD_NOMINAL_HEAD - 1);
     let early = count.stuffed;
-    count.bits(dlc(payload.len()), FD_DATA_HEAD);
+    count.bits(u32::from(frame.dlc()), FD_DATA_HEAD);
     payload.iter().for_each(|&byte| count.byte(byte));
     // The fixed stuff bit ahead of the stuff-bit count takes the place of a stuff bit due after the last bit of the data.
     let late = count.stuffed - early - u32::from(count.after_last);
@@ -307,7 +289,7 @@ impl BitStream {
         if frame.fd {
             w.dynamic(0b0100 | u32::from(frame.brs), 4 + 1 - 1);
             let start = w.bits.len();
-            w.dynamic(dlc(payload.len()), FD_DATA_HEAD);
+            w.dynamic(u32::from(frame.dlc()), FD_DATA_HEAD);
             payload.iter().for_each(|&byte| w.dynamic(byte.into(), 8));
             let (width, polynomial) = if payload.len() <= 16 { (17, CRC17) } else { (21, CRC21) };
             let count = w.stuffed % 8;
@@ -327,9 +309,9 @@ impl BitStream {
                 fast = start..w.bits.len();
             }
         } else {
-            w.dynamic(dlc(payload.len()), 6);
+            w.dynamic(u32::from(frame.dlc()), 6);
             payload.iter().for_each(|&byte| w.dynamic(byte.into(), 8));
-            let header = u32::from(frame.id & 0x7ff) << 7 | dlc(payload.len());
+            let header = u32::from(frame.id & 0x7ff) << 7 | u32::from(frame.dlc());
             let crc = (0..CLASSIC_HEADER).rev().fold(0, |crc, k| crc_step(crc, header >> k & 1 == 1, 15, CRC15));
             let bits = payload.iter().flat_map(|&byte| (0..8).rev().map(move |k| byte >> k & 1 == 1));
             w.dynamic(bits.fold(crc, |crc, bit| crc_step(crc, bit, 15, CRC15)), 15);

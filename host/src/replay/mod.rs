@@ -6,6 +6,11 @@
 //! Units and frames are those of the robot ([`composer_shared::robot`]): robot units, seconds, world z up, the ground at
 //! z = 0; a link's x axis points towards the head. Rotations are quaternions in the order x, y, z, w.
 //!
+//! The page opens at a place that its address names: `replay.html#t=3.2&episode=2&top` (seconds; episodes count from 1).
+//! Also understood: `follow`, `nums=0`, `theme=dark`, `theme=light`, `pause`, and `2d` for the view that needs no WebGL.
+//! Scripts find `window.__replay` with `ready`, `frames`, `episodes`, `time`, `lastError`, `seek(seconds)`, `play()`,
+//! `pause()` and `setEpisode(index from 0)`; the root element carries `data-ready`, `data-frames`, `data-error`.
+//!
 //! Size: a frame costs 14 bytes a link, 3 a module, one an entry of the attention matrix, and a third more for base64.
 //! 125 frames of 8 modules with 4 links are about 90 kB on top of the page.
 
@@ -162,7 +167,7 @@ pub struct FrameRecord {
     /// What success is measured by, robot units; not a number where there is nothing to show.
     pub distance: f32,
     /// Attention matrix, row-major, 255 for a weight of 1: row = attending module, column = module attended to
-    /// (the paper's A, section V-D). See [`attention_bytes`].
+    /// (the paper's A, section IV-D). See [`attention_bytes`].
     pub attention: Option<Vec<u8>>,
     /// Poses of the scene's shapes that move, in the order of the scene.
     pub moving: Vec<Pose>,
@@ -324,8 +329,7 @@ impl Recording {
             html.len().div_ceil(1000),
             folder.display()
         )))?;
-        file.persist(path)
-            .map_err(|e| fail("the finished file could not be renamed to that name".into())(e.error))?;
+        file.persist(path).map_err(|e| fail("the finished file could not be renamed to that name".into())(e.error))?;
         Ok(())
     }
 
@@ -678,7 +682,8 @@ mod tests {
 
     #[test]
     fn frames_that_do_not_fit_are_named() {
-        let cases: [(fn(&mut FrameRecord), &str); 5] = [
+        type Spoil = fn(&mut FrameRecord);
+        let cases: [(Spoil, &str); 5] = [
             (|f| f.links.truncate(30), "has 30 link poses"),
             (|f| f.status.clear(), "has 0 module states"),
             (|f| f.attention = Some(vec![0; 63]), "has 63 attention weights"),

@@ -333,3 +333,94 @@ impl Snake {
         self.motion
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Ten seconds of a travelling wave; `phase` is the lag from module to module. Returns the head's displacement along x.
+    fn wave(robot: &Robot, phase: f32) -> (f32, Snake) {
+        let mut snake = Snake::new(robot);
+        for step in 0..1000 {
+            let time = step as f32 * robot.physics_step;
+            for module in 0..robot.modules {
+                let yaw = 0.8 * robot.torque_limit * libm::sinf(std::f32::consts::TAU * time + phase * module as f32);
+                snake.set_torque(module, [yaw, 0.0]);
+            }
+            snake.step();
+        }
+        (snake.head()[0], snake)
+    }
+
+    #[test]
+    fn a_wave_propels_the_snake_against_it_and_only_with_anisotropic_friction() {
+        let robot = Robot::default();
+        let (backward, snake) = wave(&robot, 2.0);
+        let (forward, _) = wave(&robot, -2.0);
+        let (isotropic, _) = wave(&Robot { friction_along: 1.0, ..robot.clone() }, 2.0);
+        assert!(backward < -8.0 && forward > 8.0, "{backward} {forward}");
+        assert!(isotropic.abs() < 0.25 * forward, "{isotropic}");
+        assert!(snake.joint_gap() < 0.01, "{}", snake.joint_gap());
+        assert!(snake.motion().peak_joint_speed < 3.0, "{:?}", snake.motion());
+        assert!(snake.motion().peak_height < 0.5, "{:?}", snake.motion());
+    }
+
+    #[test]
+    fn the_same_torques_give_the_same_bits() {
+        let robot = Robot::default();
+        let ((a, snake_a), (b, snake_b)) = (wave(&robot, 2.0), wave(&robot, 2.0));
+        assert_eq!(a.to_bits(), b.to_bits());
+        assert!(snake_a.poses().eq(snake_b.poses()));
+    }
+
+    #[test]
+    fn a_snake_at_rest_stays_at_rest() {
+        let mut snake = Snake::new(&Robot::default());
+        (0..500).for_each(|_| snake.step());
+        let [x, y, z] = snake.head();
+        assert!(x.abs() < 0.01 && y.abs() < 0.01 && (z - 0.4).abs() < 0.02, "{x} {y} {z}");
+    }
+
+    #[test]
+    fn energy_does_not_grow_with_the_motors_off() {
+        let mut snake = Snake::new(&Robot::default());
+        for module in 0..8 {
+            snake.set_torque(module, [80.0, if module % 2 == 0 { 60.0 } else { -60.0 }]);
+        }
+        (0..60).for_each(|_| snake.step());
+        (0..8).for_each(|module| snake.set_torque(module, [0.0; 2]));
+        (0..30).for_each(|_| snake.step());
+        let mut energy = snake.energy();
+        let start = energy;
+        for _ in 0..40 {
+            (0..5).for_each(|_| snake.step());
+            let now = snake.energy();
+            assert!(now <= energy + 0.02 * start, "{energy} -> {now}");
+            energy = now;
+        }
+        assert!(energy < 0.8 * start, "{start} -> {energy}");
+    }
+
+    #[test]
+    fn sensors_and_chain_kinematics_agree_with_the_simulated_truth() {
+        let robot = Robot::default();
+        let (_, mut snake) = wave(&robot, 1.3);
+        for module in 0..8 {
+            snake.set_torque(module, [25.0, -8.0 + 2.0 * module as f32]);
+        }
+        (0..150).for_each(|_| snake.step());
+        let mut chain = composer_shared::kinematics::Chain::new(robot.geometry());
+        for module in 0..robot.modules {
+            chain.hear(module, &snake.sensors(module).joint_angles);
+        }
+        let goal = [7.0, -4.0, 0.4];
+        for module in 0..robot.modules {
+            let through_chain = chain.head_seen_from(module).point(snake.in_head_frame(goal).into());
+            let truth = snake.in_own_frame(module, goal);
+            let error = (0..3).map(|i| (through_chain[i] - truth[i]).abs()).fold(0.0, f32::max);
+            let distance = truth.iter().map(|v| v * v).sum::<f32>().sqrt();
+            // The chain assumes perfect hinges; under full torque the solver lets them give a little.
+            assert!(error < 0.01 * distance, "module {module}: {through_chain:?} against {truth:?}");
+        }
+    }
+}

@@ -1,0 +1,934 @@
+//! One module as a state machine without I/O.
+//!
+//! # The control cycle
+//!
+//! 1. SYNC starts cycle *c*. The *time-keeper* sends it: the live module nearest the head.
+//! 2. The module samples its sensors and sends STATE(*c*). As soon as it has the STATE(*c*) of every live neighbour and the station's
+//!    GOAL(*c*), or at the state deadline, it computes its observation, encodes it and sends LATENT(*c*).
+//! 3. As soon as it has the LATENT(*c*) of every live neighbour, or at the collection deadline, it attends over those it has, acts,
+//!    and applies the torque within its limits. What comes later is masked.
+//!
+//! A neighbour that is silent for [`Timing::dead_after`] cycles is not waited for any more; a fresh frame brings it back.
+//!
+//! # Time-keeper
+//!
+//! There is no election traffic. A module that hears no SYNC for [`Timing::takeover_periods`] periods takes over, each a little later
+//! than the live ones nearer the head (after power-up, when nobody is known, than all nearer the head). Of two time-keepers that
+//! hear each other the one nearer the head goes on and the other follows it; so the two parts of a cut chain go on by themselves and
+//! become one again after mending. A module that finds itself the live one nearest the head for three cycles takes the time over
+//! by sending SYNC a twentieth of a period before it is due.
+//!
+//! A SYNC that got lost on its way to one module costs nothing: if a neighbour's frame of the next cycle is here when the
+//! cycle is overdue, the module starts it too.
+//!
+//! # Goal
+//!
+//! GOAL is given in the frame of the head link, so an old one becomes wrong as the head moves: without a new one it holds for
+//! [`Timing::goal_memory`] cycles, then the goal is unknown. A policy whose goal is known to the head uses it in module 0 only.
+//!
+//! # Time
+//!
+//! `now` is the module's own clock: microseconds since any origin, monotonic. Only differences count. A clock that steps back
+//! counts as standing still.
+
+use composer_shared::kinematics::Chain;
+use composer_shared::observation::{Sensors, observe, place};
+use composer_shared::policy::{Encoded, GoalKnownTo, Policy};
+use composer_shared::robot::{AXES, Limits, MAX_MODULES};
+use composer_shared::wire::{
+    EmergencyStop, FRAGMENTS, Frame, Goal, Health, Heartbeat, LatentMessage, Message, Mode, NOBODY, PROTOCOL_VERSION,
+    STATION, State, StopCommand, Sync, Telemetry, quantise_angle,
+};
+use nalgebra::Vector3;
+
+use crate::failsafe::Failsafe;
+pub use crate::failsafe::{BusOffPolicy, BusStatus, Fault, FaultSet, LimitedBy};
+use crate::neighbours::{Heard, Neighbours, bit};
+
+/// Time in microseconds, or a moment of the module's own clock.
+pub type Micros = u64;
+
+/// Version of the firmware as HEARTBEAT says it: major in the upper, minor in the lower 4 bits.
+pub const FIRMWARE_VERSION: u8 = 0x01;
+
+/// Cycles between two TELEMETRY frames, and between two HEARTBEAT frames.
+pub const REPORT_EVERY: u16 = 10;
+
+/// Cycles for which a module must find itself the live one nearest the head before it takes the time over.
+const CLAIM_AFTER: u8 = 3;
+
+/// Kind of bus.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum BusKind {
+    /// CAN 2.0 with 8-byte frames: a latent travels in eight pieces.
+    Classic,
+    /// CAN-FD with 64-byte frames and bit-rate switch.
+    Fd,
+}
+
+/// When things happen within and over control cycles.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Timing {
+    /// Control period.
+    pub period_us: u32,
+    /// After the start of a cycle: observe with the STATE frames that came.
+    pub state_deadline_us: u32,
+    /// After the start of a cycle: act on the latents that came. Longer waits for more latents under load, shorter acts fresher.
+    pub collect_deadline_us: u32,
+    /// Periods without SYNC after which the next module keeps the time.
+    pub takeover_periods: u8,
+    /// How much later each further candidate takes over; longer than a SYNC can be delayed by traffic.
+    pub takeover_stagger_us: u32,
+    /// Cycles without a frame after which a neighbour counts as dead.
+    pub dead_after: u8,
+    /// Periods without any frame after which a module relaxes its motors.
+    pub isolated_after: u8,
+    /// Periods without SYNC after which a module relaxes its motors.
+    pub sync_lost_after: u8,
+    /// How much later than promised a poll may come before the watchdog latches.
+    pub poll_grace_us: u32,
+    /// Cycles for which a goal holds when no new one comes.
+    pub goal_memory: u8,
+}
+
+impl Timing {
+    /// The defaults for a policy's control period and a bus of 1 Mbit/s (data phase of FD: 5 Mbit/s): the collection deadline is twice the
+    /// bus time of all modules' frames plus 5 ms, at least 20 % and at most 80 % of the period; the state deadline is a third of it.
+    pub fn for_policy(policy: &Policy<'_>, bus: BusKind, modules: u8) -> Self {
+        let period_us = policy.control_period_us();
+        let needed = Self::bus_time_us(bus, modules).saturating_mul(2).saturating_add(5_000);
+        let collect_deadline_us = needed.max(period_us / 5).min(period_us / 5 * 4);
+        Timing {
+            period_us,
+            state_deadline_us: collect_deadline_us / 3,
+            collect_deadline_us,
+            takeover_periods: 2,
+            takeover_stagger_us: period_us / 10,
+            dead_after: composer_shared::robot::DEAD_AFTER,
+            isolated_after: 20,
+            sync_lost_after: 4,
+            poll_grace_us: period_us,
+            goal_memory: 4,
+        }
+    }
+
+    /// About how long the STATE and LATENT frames of all modules occupy the bus in one cycle, with worst-case bit stuffing at
+    /// 1 Mbit/s and 5 Mbit/s. If this exceeds the period, the modules farthest from the head are never heard.
+    pub fn bus_time_us(bus: BusKind, modules: u8) -> u32 {
+        let per_module = match bus {
+            BusKind::Classic => 135 * (1 + FRAGMENTS as u32),
+            BusKind::Fd => 56 + 169,
+        };
+        u32::from(modules) * per_module + 270
+    }
+}
+
+/// What makes one module different from the next.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Config {
+    /// This module's number: 0 is the head.
+    pub node: u8,
+    /// Modules of the robot, 1 to 64.
+    pub modules: u8,
+    /// The bus they are on.
+    pub bus: BusKind,
+    /// What to do after bus-off.
+    pub bus_off: BusOffPolicy,
+    /// When things happen.
+    pub timing: Timing,
+}
+
+impl Config {
+    /// Module `node` of `modules` with the default timing, recovering from bus-off.
+    pub fn new(node: u8, modules: u8, bus: BusKind, policy: &Policy<'_>) -> Self {
+        let timing = Timing::for_policy(policy, bus, modules);
+        Config { node, modules, bus, bus_off: BusOffPolicy::Recover, timing }
+    }
+
+    fn check(&self) -> Result<(), ConfigError> {
+        if self.modules == 0 || usize::from(self.modules) > MAX_MODULES {
+            return Err(ConfigError::Modules(self.modules));
+        }
+        if self.node >= self.modules {
+            return Err(ConfigError::Node { node: self.node, modules: self.modules });
+        }
+        let t = &self.timing;
+        if t.period_us < 1000 {
+            return Err(ConfigError::Period(t.period_us));
+        }
+        if t.state_deadline_us == 0
+            || t.state_deadline_us >= t.collect_deadline_us
+            || t.collect_deadline_us >= t.period_us
+        {
+            return Err(ConfigError::Deadlines {
+                state: t.state_deadline_us,
+                collect: t.collect_deadline_us,
+                period: t.period_us,
+            });
+        }
+        let counts = [
+            ("takeover_periods", u32::from(t.takeover_periods)),
+            ("takeover_stagger_us", t.takeover_stagger_us),
+            ("dead_after", u32::from(t.dead_after)),
+            ("isolated_after", u32::from(t.isolated_after)),
+            ("sync_lost_after", u32::from(t.sync_lost_after)),
+            ("poll_grace_us", t.poll_grace_us),
+        ];
+        counts.into_iter().find(|(_, n)| *n == 0).map_or(Ok(()), |(field, _)| Err(ConfigError::Zero(field)))
+    }
+}
+
+/// Why a configuration is refused.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ConfigError {
+    /// No modules, or more than there are identifiers for.
+    Modules(u8),
+    /// The module is not one of the robot's.
+    Node {
+        /// Its number.
+        node: u8,
+        /// How many there are.
+        modules: u8,
+    },
+    /// The control period is too short.
+    Period(u32),
+    /// The deadlines are not in order.
+    Deadlines {
+        /// State deadline, microseconds.
+        state: u32,
+        /// Collection deadline, microseconds.
+        collect: u32,
+        /// Control period, microseconds.
+        period: u32,
+    },
+    /// A field of [`Timing`] that must not be zero.
+    Zero(&'static str),
+}
+
+impl core::fmt::Display for ConfigError {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        match *self {
+            ConfigError::Modules(n) => write!(f, "{n} modules cannot be: a robot has 1 to {MAX_MODULES}"),
+            ConfigError::Node { node, modules } => {
+                write!(
+                    f,
+                    "module {node} cannot be one of {modules}: they are numbered 0 to {}",
+                    modules.saturating_sub(1)
+                )
+            }
+            ConfigError::Period(us) => {
+                write!(f, "a control period of {us} us is too short: at least 1000 us are needed")
+            }
+            ConfigError::Deadlines { state, collect, period } => write!(
+                f,
+                "the deadlines must be in order, 0 < state < collection < period, but are {state}, {collect} and {period} us"
+            ),
+            ConfigError::Zero(field) => write!(f, "{field} is 0, but must be at least 1"),
+        }
+    }
+}
+
+impl core::error::Error for ConfigError {}
+
+/// What [`Controller::poll`] wants done.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Outputs {
+    /// Torque for the motors now, yaw and pitch, in the robot's torque unit; within the torque limit, changed no faster than the slew
+    /// limit. Zero when relaxed.
+    pub torque: [f32; AXES],
+    /// Whether the motors follow `torque`; if not, switch them off.
+    pub motors_enabled: bool,
+    /// Poll again no later than this, received frame or not. Always later than `now`.
+    pub deadline: Micros,
+}
+
+/// Counters since power-up; they saturate.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Stats {
+    /// Control cycles started.
+    pub cycles: u32,
+    /// Control cycles in which the module acted; the others were cut short by the next SYNC.
+    pub acted: u32,
+    /// Cycles in which a live neighbour's latent was missing when the module acted.
+    pub deadline_misses: u32,
+    /// Age of the oldest latent used in the last cycle: from the start of its cycle to the action.
+    pub latent_age_us: u32,
+    /// The largest that ever was.
+    pub latent_age_max_us: u32,
+    /// Frames whose identifier or content is not of this protocol.
+    pub malformed: u32,
+    /// Frames of modules that this robot does not have.
+    pub foreign: u32,
+    /// STATE, LATENT, GOAL and SYNC frames of another cycle than the current or next.
+    pub stale: u32,
+    /// Times this module became time-keeper.
+    pub takeovers: u32,
+    /// Cycles started without their SYNC, because a neighbour was already in them.
+    pub without_sync: u32,
+}
+
+fn up(counter: &mut u32) {
+    *counter = counter.saturating_add(1);
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Phase {
+    /// Before the first cycle, or done with this one.
+    Done,
+    /// Waiting for STATE frames.
+    States,
+    /// Waiting for LATENT frames.
+    Latents,
+}
+
+/// Frames waiting to be sent, one slot each: a newer one replaces an older one that never got onto the bus.
+#[derive(Clone, Debug, Default)]
+struct Outbox {
+    stop: Option<EmergencyStop>,
+    sync: Option<Sync>,
+    state: Option<State>,
+    latent: Option<LatentMessage>,
+    /// Pieces of the latent already sent (classic bus).
+    pieces_sent: u8,
+    telemetry: Option<Telemetry>,
+    heartbeat: Option<Heartbeat>,
+}
+
+#[derive(Clone, Copy, Debug, Default)]
+struct GoalMemory {
+    position: Option<[f32; 3]>,
+    /// Cycles since it was told; saturating.
+    age: u8,
+    /// Cycles since the station was heard.
+    silent: u8,
+    /// That of the next cycle, told before its SYNC came.
+    next: Option<Goal>,
+}
+
+/// The controller of one module.
+#[derive(Clone, Debug)]
+pub struct Controller<'a> {
+    config: Config,
+    policy: Policy<'a>,
+    limits: Limits,
+    relax_factor: f32,
+
+    now: Micros,
+    failsafe: Failsafe,
+    neighbours: Neighbours,
+    chain: Chain,
+    outbox: Outbox,
+
+    time_keeper: Option<u8>,
+    /// When SYNC was last heard or sent; power-up before the first.
+    last_sync: Micros,
+    /// When this module sends SYNC, if it is the time-keeper or claims to be.
+    next_sync: Option<Micros>,
+    /// Cycles in which nobody nearer the head was alive.
+    nearest_for: u8,
+
+    cycle: u16,
+    cycle_start: Option<Micros>,
+    phase: Phase,
+    sample: Sensors,
+    encoded: Option<Encoded>,
+    goal: GoalMemory,
+    last_heard: Micros,
+    last_act: Option<Micros>,
+
+    torque: [f32; AXES],
+    enabled: bool,
+    limited_by: LimitedBy,
+    used: u64,
+    attention: [u16; MAX_MODULES],
+
+    last_heartbeat: Option<Micros>,
+    faults_told: FaultSet,
+    stats: Stats,
+}
+
+/// The factor by which the joints of a silent module relax in one control period, for [`Chain::miss`].
+pub fn relax_factor(period_us: u32, relax_seconds: f32) -> f32 {
+    libm::expf(-(period_us as f32 / 1e6) / relax_seconds)
+}
+
+impl<'a> Controller<'a> {
+    /// A module that was switched on at `now`. It listens, and starts the clock itself if nobody else does.
+    pub fn new(config: Config, policy: Policy<'a>, now: Micros) -> Result<Self, ConfigError> {
+        config.check()?;
+        let timing = &config.timing;
+        let limits = policy.limits();
+        Ok(Controller {
+            limits,
+            relax_factor: relax_factor(timing.period_us, policy.relax_seconds()),
+            now,
+            failsafe: Failsafe::new(limits, config.bus_off, timing.poll_grace_us),
+            neighbours: Neighbours::new(config.node, config.modules, timing.dead_after, policy.tag()),
+            chain: Chain::new(policy.geometry()),
+            outbox: Outbox::default(),
+            time_keeper: None,
+            last_sync: now,
+            next_sync: None,
+            nearest_for: 0,
+            cycle: 0,
+            cycle_start: None,
+            phase: Phase::Done,
+            sample: Sensors::ZERO,
+            encoded: None,
+            goal: GoalMemory::default(),
+            last_heard: now,
+            last_act: None,
+            torque: [0.0; AXES],
+            enabled: false,
+            limited_by: LimitedBy::Relaxed,
+            used: 0,
+            attention: [0; MAX_MODULES],
+            last_heartbeat: None,
+            faults_told: FaultSet::EMPTY,
+            stats: Stats::default(),
+            config,
+            policy,
+        })
+    }
+
+    /// Goes on to `now`: takes one received frame, or `None` when only time passed.
+    ///
+    /// Call it for every received frame, and at the latest at the last answer's deadline. `sensors` are the latest readings; the sample
+    /// of a cycle is taken when the cycle starts. Do not feed the module's own frames back: a frame with its own number means
+    /// that another node has the same. Send what [`Controller::next_frame`] offers afterwards.
+    ///
+    /// Cost: at most one encoding and one action, whatever is received. Never panics. Deadlines are kept on every call, so a flood of
+    /// frames does not delay them.
+    pub fn poll(&mut self, now: Micros, sensors: &Sensors, received: Option<&Frame>, bus: BusStatus) -> Outputs {
+        let now = now.max(self.now);
+        self.now = now;
+        self.failsafe.check_poll(now);
+        self.failsafe.check_bus(bus);
+        self.failsafe.check_temperature(sensors.temperature);
+        if let Some(frame) = received {
+            self.receive(frame, sensors);
+        }
+        self.keep_time(sensors);
+        self.supervise();
+        self.advance();
+        self.report();
+        let deadline = self.deadline();
+        self.failsafe.promise(deadline);
+        Outputs { torque: self.torque, motors_enabled: self.enabled, deadline }
+    }
+
+    /// The next frame to send, the most urgent first; call it whenever the CAN port has room. A frame that is still waiting in the port
+    /// when the same function is offered again is out of date: replace it if the port can.
+    pub fn next_frame(&mut self) -> Option<Frame> {
+        if self.failsafe.silenced() {
+            self.outbox = Outbox::default();
+            return None;
+        }
+        let (node, fd) = (self.config.node, self.config.bus == BusKind::Fd);
+        let outbox = &mut self.outbox;
+        let message = if let Some(m) = outbox.stop.take() {
+            Message::EmergencyStop(m)
+        } else if let Some(m) = outbox.sync.take() {
+            Message::Sync(m)
+        } else if let Some(m) = outbox.state.take() {
+            Message::State(m)
+        } else if let Some(m) = outbox.latent.take() {
+            if fd {
+                Message::Latent(m)
+            } else {
+                let piece = *m.fragments().get(usize::from(outbox.pieces_sent))?;
+                outbox.pieces_sent += 1;
+                if usize::from(outbox.pieces_sent) < FRAGMENTS {
+                    outbox.latent = Some(m);
+                }
+                Message::LatentFragment(piece)
+            }
+        } else if let Some(m) = outbox.telemetry.take() {
+            Message::Telemetry(m)
+        } else {
+            Message::Heartbeat(outbox.heartbeat.take()?)
+        };
+        Some(message.emit(node, fd))
+    }
+
+    /// Stops the whole robot from here (a button, a supervisor): latched like a stop from the bus, and told to all others.
+    /// The motors relax with the next poll.
+    pub fn emergency_stop(&mut self) {
+        self.failsafe.stop();
+        self.outbox.stop = Some(EmergencyStop::new(StopCommand::Stop, 0));
+    }
+
+    /// The active faults.
+    pub fn faults(&self) -> FaultSet {
+        self.failsafe.faults()
+    }
+
+    /// Whether the CAN port may recover from bus-off by itself.
+    pub fn may_recover_bus(&self) -> bool {
+        self.failsafe.may_recover()
+    }
+
+    /// What holds the torque back.
+    pub fn limited_by(&self) -> LimitedBy {
+        self.limited_by
+    }
+
+    /// What the module is at.
+    pub fn mode(&self) -> Mode {
+        let silent = self.now.saturating_sub(self.last_heard);
+        if self.cycle_start.is_none() {
+            Mode::Boot
+        } else if self.failsafe.relaxed() {
+            Mode::Relaxed
+        } else if self.config.modules > 1 && silent > self.periods(self.config.timing.dead_after) {
+            Mode::Alone
+        } else {
+            Mode::Active
+        }
+    }
+
+    /// Number of the current control cycle.
+    pub fn cycle(&self) -> u16 {
+        self.cycle
+    }
+
+    /// Whose SYNC the module follows; its own number if it keeps the time.
+    pub fn time_keeper(&self) -> Option<u8> {
+        self.time_keeper
+    }
+
+    /// Modules believed alive, itself included, as a bit mask.
+    pub fn alive(&self) -> u64 {
+        self.neighbours.alive() | self.own_bit()
+    }
+
+    /// Modules attended over in the last action, itself included, as a bit mask.
+    pub fn heard(&self) -> u64 {
+        self.used | self.own_bit()
+    }
+
+    /// The attention weights of the last action by module, Q15 (32767 is 1).
+    pub fn attention(&self) -> &[u16; MAX_MODULES] {
+        &self.attention
+    }
+
+    /// Counters.
+    pub fn stats(&self) -> &Stats {
+        &self.stats
+    }
+
+    /// Its configuration.
+    pub fn config(&self) -> &Config {
+        &self.config
+    }
+
+    /// What TELEMETRY would say now.
+    pub fn telemetry(&self) -> Telemetry {
+        let others = self.attention.iter().enumerate().filter(|(j, w)| *j != self.own() && **w > 0);
+        let most = others.max_by_key(|(_, w)| **w);
+        Telemetry {
+            torque: self.torque.map(|t| libm::roundf(t / self.limits.torque * 127.0) as i8),
+            temperature: self.sample.temperature as i8,
+            limited_by: self.limited_by as u8,
+            heard: self.heard().count_ones() as u8,
+            deadline_misses: self.stats.deadline_misses as u8,
+            attends_to: most.map_or(NOBODY, |(j, _)| j as u8),
+            // Q15 to 1/255.
+            attention: most.map_or(0, |(_, w)| (u32::from(*w) * 255 / 32767).min(255) as u8),
+        }
+    }
+
+    /// What HEARTBEAT would say now.
+    pub fn heartbeat(&self) -> Heartbeat {
+        Heartbeat {
+            mode: self.mode() as u8,
+            fault: self.faults().number(),
+            health: self.health(),
+            time_keeper: self.time_keeper.unwrap_or(NOBODY),
+            protocol: PROTOCOL_VERSION,
+            firmware: FIRMWARE_VERSION,
+            policy: self.policy.tag(),
+        }
+    }
+
+    fn own(&self) -> usize {
+        usize::from(self.config.node)
+    }
+
+    fn own_bit(&self) -> u64 {
+        bit(self.config.node)
+    }
+
+    fn period(&self) -> Micros {
+        u64::from(self.config.timing.period_us)
+    }
+
+    fn periods(&self, count: u8) -> Micros {
+        u64::from(count) * self.period()
+    }
+
+    fn health(&self) -> Health {
+        let faults = self.faults();
+        let flags = [
+            (Health::SENSORS_PLAUSIBLE, self.sample.plausible()),
+            (Health::MOTORS_ENABLED, self.enabled),
+            (Health::EMERGENCY_STOP, faults.contains(Fault::EmergencyStop)),
+            (Health::FAULT, !faults.is_empty()),
+        ];
+        flags.into_iter().fold(Health(0), |health, (flag, set)| if set { health.with(flag) } else { health })
+    }
+
+    // Receiving
+
+    fn receive(&mut self, frame: &Frame, sensors: &Sensors) {
+        let Ok(message) = Message::parse(frame) else {
+            return up(&mut self.stats.malformed);
+        };
+        let module = frame.module();
+        // A stop counts whoever sends it.
+        if let Message::EmergencyStop(stop) = message {
+            match stop.command() {
+                StopCommand::Stop => self.failsafe.stop(),
+                StopCommand::Release => self.failsafe.release(),
+            }
+        }
+        if module == self.config.node {
+            self.failsafe.set(Fault::DuplicateNode, true);
+            self.time_keeper = self.time_keeper.filter(|k| *k != module);
+            self.next_sync = None;
+            return;
+        }
+        if module != STATION && module >= self.config.modules {
+            return up(&mut self.stats.foreign);
+        }
+        self.last_heard = self.now;
+        self.neighbours.hear(module);
+        let heard = match message {
+            Message::EmergencyStop(_) | Message::Telemetry(_) => Heard::Now,
+            Message::Sync(sync) => self.hear_sync(module, sync, sensors),
+            Message::Goal(goal) => self.hear_goal(goal),
+            Message::State(state) => {
+                self.inherit_stop(state.health);
+                self.neighbours.hear_state(module, state)
+            }
+            Message::Latent(latent) => {
+                self.inherit_stop(latent.health);
+                self.neighbours.hear_latent(module, &latent)
+            }
+            Message::LatentFragment(fragment) => match self.neighbours.hear_fragment(module, &fragment) {
+                Ok(heard) => heard,
+                Err(_) => return up(&mut self.stats.malformed),
+            },
+            Message::Heartbeat(heartbeat) => {
+                self.inherit_stop(heartbeat.health);
+                self.neighbours.hear_policy(module, heartbeat.policy);
+                Heard::Now
+            }
+        };
+        if heard == Heard::Stale {
+            up(&mut self.stats.stale);
+        }
+    }
+
+    /// A module that is plugged in while the robot is stopped must not move either. Only until its first cycle: later, a neighbour's
+    /// frame from just before the release would stop it again.
+    fn inherit_stop(&mut self, health: Health) {
+        if self.cycle_start.is_none() && health.has(Health::EMERGENCY_STOP) {
+            self.failsafe.stop();
+        }
+    }
+
+    fn hear_sync(&mut self, from: u8, sync: Sync, sensors: &Sensors) -> Heard {
+        let silence = self.now.saturating_sub(self.last_sync);
+        let since_start = self.cycle_start.map(|start| self.now.saturating_sub(start));
+        let lost = silence > self.period() + self.period() / 2;
+        let ahead = sync.cycle.wrapping_sub(self.cycle) as i16;
+        match self.time_keeper {
+            // Who is nearer the head keeps the time; this module's own SYNC makes the other one yield.
+            Some(keeper) if from > keeper && (keeper == self.config.node || !lost) => return Heard::Stale,
+            // A frame that was held up or repeated.
+            Some(keeper) if from == keeper && !lost && ahead < 0 => return Heard::Stale,
+            // Nobody keeps time that badly: a babbling node must not drive the cycle.
+            Some(keeper) if from == keeper && ahead > 0 && since_start.is_some_and(|t| t < self.period() / 4) => {
+                return Heard::Stale;
+            }
+            _ => {}
+        }
+        self.time_keeper = Some(from);
+        self.next_sync = None;
+        self.last_sync = self.now;
+        // Already in this cycle, by a neighbour's frame or by another time-keeper's SYNC.
+        let known = ahead == 0 && since_start.is_some_and(|t| t < self.period() / 4 * 3);
+        if !known {
+            self.start_cycle(sync.cycle, sensors);
+        }
+        Heard::Now
+    }
+
+    fn hear_goal(&mut self, goal: Goal) -> Heard {
+        self.goal.silent = 0;
+        if self.cycle_start.is_none() {
+            return Heard::Stale;
+        }
+        let age = (self.cycle as u8).wrapping_sub(goal.cycle);
+        if age == u8::MAX {
+            self.goal.next = Some(goal);
+            Heard::Next
+        } else if age <= self.goal.age && age <= self.config.timing.goal_memory {
+            self.goal.position = goal.position();
+            self.goal.age = age;
+            Heard::Now
+        } else {
+            Heard::Stale
+        }
+    }
+
+    // Keeping time
+
+    fn keep_time(&mut self, sensors: &Sensors) {
+        if self.failsafe.faults().contains(Fault::DuplicateNode) {
+            return;
+        }
+        let now = self.now;
+        let node = self.config.node;
+        if let Some(due) = self.next_sync {
+            if now >= due {
+                if self.time_keeper != Some(node) {
+                    up(&mut self.stats.takeovers);
+                }
+                self.time_keeper = Some(node);
+                // After a gap the beat starts anew instead of catching up.
+                let next = due.saturating_add(self.period());
+                self.next_sync = Some(if next > now { next } else { now.saturating_add(self.period()) });
+                self.send_sync(self.cycle.wrapping_add(1), sensors);
+            }
+        } else if now >= self.takeover_at() {
+            up(&mut self.stats.takeovers);
+            self.time_keeper = Some(node);
+            let period = self.period();
+            match self.cycle_start {
+                // Just started without SYNC: that was the right time, announce it.
+                Some(start) if now.saturating_sub(start) < period / 2 => {
+                    self.next_sync = Some(start.saturating_add(period));
+                    self.last_sync = now;
+                    self.outbox.sync = Some(Sync::new(self.cycle, self.alive_count()));
+                }
+                start => {
+                    // The lost time-keeper's numbers go on, so that modules that follow it without SYNC agree.
+                    let gap = start.map_or(period, |start| now.saturating_sub(start));
+                    let cycles = ((gap + period / 2) / period.max(1)).max(1);
+                    self.next_sync = Some(now.saturating_add(period));
+                    self.send_sync(self.cycle.wrapping_add(cycles as u16), sensors);
+                }
+            }
+        } else if self.overdue_at().is_some_and(|at| now >= at) && self.neighbours.next_cycle_seen() {
+            up(&mut self.stats.without_sync);
+            self.start_cycle(self.cycle.wrapping_add(1), sensors);
+        }
+    }
+
+    fn alive_count(&self) -> u8 {
+        self.alive().count_ones() as u8
+    }
+
+    fn send_sync(&mut self, cycle: u16, sensors: &Sensors) {
+        self.last_sync = self.now;
+        self.outbox.sync = Some(Sync::new(cycle, self.alive_count()));
+        self.start_cycle(cycle, sensors);
+    }
+
+    /// When this module takes over from a silent time-keeper: later for each live module before it in line.
+    fn takeover_at(&self) -> Micros {
+        let timing = &self.config.timing;
+        let keeper = self.time_keeper.map_or(0, bit);
+        let before = self.neighbours.alive() & crate::neighbours::first(self.config.node) & !keeper;
+        let turn = u64::from(before.count_ones()) + 1;
+        let wait = self.periods(timing.takeover_periods) + turn * u64::from(timing.takeover_stagger_us);
+        self.last_sync.saturating_add(wait)
+    }
+
+    /// When a cycle is so late that its SYNC must have been lost.
+    fn overdue_at(&self) -> Option<Micros> {
+        let start = self.cycle_start.filter(|_| self.next_sync.is_none())?;
+        Some(start.saturating_add(self.period() + self.period() / 25))
+    }
+
+    // The control cycle
+
+    fn start_cycle(&mut self, cycle: u16, sensors: &Sensors) {
+        let follows = self.cycle.wrapping_add(1) == cycle && self.cycle_start.is_some();
+        let low = cycle as u8;
+        self.cycle = cycle;
+        self.cycle_start = Some(self.now);
+        self.phase = Phase::States;
+        self.encoded = None;
+        self.sample = *sensors;
+        self.failsafe.check_sample(sensors);
+        self.neighbours.start(low);
+        self.failsafe.set(Fault::PolicyMismatch, self.neighbours.mismatch() != 0);
+        up(&mut self.stats.cycles);
+
+        self.goal.age = self.goal.age.saturating_add(1);
+        self.goal.silent = self.goal.silent.saturating_add(1);
+        if let Some(goal) = self.goal.next.take().filter(|goal| follows && goal.cycle == low) {
+            self.goal.position = goal.position();
+            self.goal.age = 0;
+        }
+        if self.goal.age > self.config.timing.goal_memory {
+            self.goal.position = None;
+        }
+
+        // Somebody who follows another though nobody nearer the head lives will keep the time soon.
+        let nearer = self.neighbours.alive() & crate::neighbours::first(self.config.node);
+        self.nearest_for = if nearer == 0 { self.nearest_for.saturating_add(1) } else { 0 };
+        if self.time_keeper != Some(self.config.node) && self.nearest_for >= CLAIM_AFTER && !self.failsafe.silenced() {
+            self.next_sync = Some(self.now.saturating_add(self.period() - self.period() / 20));
+        }
+
+        self.outbox.latent = None;
+        self.outbox.state = Some(State::new(low, self.health(), &sensors.joint_angles));
+        if cycle.wrapping_add(u16::from(self.config.node)) % REPORT_EVERY == 0 {
+            self.outbox.telemetry = Some(self.telemetry());
+        }
+    }
+
+    /// Whether this module is told the goal.
+    fn uses_goal(&self) -> bool {
+        self.policy.goal_known_to() == GoalKnownTo::All || self.config.node == 0
+    }
+
+    fn advance(&mut self) {
+        let Some(start) = self.cycle_start else { return };
+        let since = self.now.saturating_sub(start);
+        let timing = self.config.timing;
+        if self.phase == Phase::States {
+            let goal_due = self.uses_goal() && self.goal.silent <= timing.goal_memory && self.goal.age > 0;
+            let complete = self.neighbours.missing_states() == 0 && !goal_due;
+            if complete || since >= u64::from(timing.state_deadline_us) {
+                self.observe();
+            }
+        }
+        if self.phase == Phase::Latents {
+            let complete = !self.policy.attention() || self.neighbours.missing_latents() == 0;
+            if complete || since >= u64::from(timing.collect_deadline_us) {
+                if !complete {
+                    up(&mut self.stats.deadline_misses);
+                }
+                self.act(since);
+            }
+        }
+    }
+
+    fn observe(&mut self) {
+        for module in 0..self.config.modules {
+            let angles = if module == self.config.node {
+                // Rounded like everybody else's: all modules lay out the same chain.
+                self.sample.plausible().then(|| self.sample.joint_angles.map(quantise_angle))
+            } else {
+                self.neighbours.state(module).map(|state| state.angles())
+            };
+            match angles {
+                Some(angles) => self.chain.hear(usize::from(module), &angles),
+                None => self.chain.miss(usize::from(module), self.relax_factor),
+            }
+        }
+        let head = self.chain.head_seen_from(self.own());
+        let goal = self.goal.position.filter(|_| self.uses_goal()).map(Vector3::from);
+        let place = place(self.own(), usize::from(self.config.modules));
+        let encoded = self.policy.encode(&observe(&self.sample, place, &head, goal));
+        if self.policy.attention() {
+            self.outbox.pieces_sent = 0;
+            self.outbox.latent = Some(LatentMessage {
+                cycle: self.cycle as u8,
+                health: self.health(),
+                policy: self.policy.tag(),
+                key: encoded.latent.key,
+                value: encoded.latent.value,
+            });
+        }
+        self.encoded = Some(encoded);
+        self.phase = Phase::Latents;
+    }
+
+    fn act(&mut self, since_start: Micros) {
+        self.phase = Phase::Done;
+        let Some(encoded) = self.encoded else { return };
+        self.used = if self.policy.attention() { self.neighbours.usable() } else { 0 };
+        let (own, latents) = (self.own(), self.neighbours.latents());
+        let action = self.policy.act(&encoded, latents, self.used, Some(&mut self.attention), own);
+        // A full period between two actions is the rule and what the policy was trained with; only after a change of time-keeper
+        // can it be much shorter, and then the slew limit must still hold.
+        let period = self.period();
+        let elapsed = self.last_act.map_or(period, |last| self.now.saturating_sub(last));
+        let seconds = if elapsed >= period / 4 * 3 { period } else { elapsed } as f32 / 1e6;
+        let (torque, limited_by) = self.failsafe.command(self.torque, action, seconds, &self.sample);
+        self.torque = torque;
+        self.limited_by = limited_by;
+        self.enabled = !self.failsafe.relaxed();
+        self.last_act = Some(self.now);
+        up(&mut self.stats.acted);
+        if self.used != 0 {
+            self.stats.latent_age_us = u32::try_from(since_start).unwrap_or(u32::MAX);
+            self.stats.latent_age_max_us = self.stats.latent_age_max_us.max(self.stats.latent_age_us);
+        }
+    }
+
+    /// Relaxes the motors as soon as there is a reason.
+    fn supervise(&mut self) {
+        let timing = &self.config.timing;
+        let sync_lost = self.cycle_start.is_some()
+            && self.now.saturating_sub(self.last_sync) > self.periods(timing.sync_lost_after);
+        let silence = self.now.saturating_sub(self.last_heard);
+        let isolated = self.config.modules > 1 && silence > self.periods(timing.isolated_after);
+        self.failsafe.set(Fault::SyncLost, sync_lost);
+        self.failsafe.set(Fault::Isolated, isolated);
+        if self.failsafe.relaxed() {
+            self.torque = [0.0; AXES];
+            self.enabled = false;
+            self.limited_by = LimitedBy::Relaxed;
+        }
+    }
+
+    /// Queues a HEARTBEAT: every [`REPORT_EVERY`] periods, and when the faults change, but never more than one a period.
+    fn report(&mut self) {
+        let changed = self.faults() != self.faults_told;
+        let wait = if changed { self.period() } else { u64::from(REPORT_EVERY) * self.period() };
+        if self.last_heartbeat.is_none_or(|last| self.now.saturating_sub(last) >= wait) {
+            self.last_heartbeat = Some(self.now);
+            self.faults_told = self.faults();
+            self.outbox.heartbeat = Some(self.heartbeat());
+        }
+    }
+
+    /// The next moment at which something happens without a frame.
+    fn deadline(&self) -> Micros {
+        let timing = &self.config.timing;
+        let mut deadline = self.now.saturating_add(self.period());
+        let mut at = |moment: Micros| {
+            if moment > self.now {
+                deadline = deadline.min(moment);
+            }
+        };
+        match self.next_sync {
+            Some(due) => at(due),
+            None => at(self.takeover_at()),
+        }
+        if let Some(start) = self.cycle_start {
+            match self.phase {
+                Phase::States => at(start.saturating_add(u64::from(timing.state_deadline_us))),
+                Phase::Latents => at(start.saturating_add(u64::from(timing.collect_deadline_us))),
+                Phase::Done => {}
+            }
+            if let Some(overdue) = self.overdue_at() {
+                at(overdue);
+            }
+            at(self.last_sync.saturating_add(self.periods(timing.sync_lost_after) + 1));
+        }
+        at(self.last_heard.saturating_add(self.periods(timing.isolated_after) + 1));
+        // The clock cannot go beyond the end of time; nothing else can make this fail.
+        deadline.max(self.now.saturating_add(1))
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,133 @@
+//! `snakectl eval`: a policy in the simulator, without a bus.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use anyhow::{Result, bail};
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::PolicySource;
+use composer_sim_bridge::faults::{FaultPlan, ScheduledFault};
+
+use crate::env::knows_fault;
+use crate::eval::{Report, Trial};
+use crate::robot::Robot;
+
+/// What to evaluate and how; `sil` takes the same.
+#[derive(clap::Args, Clone, Debug)]
+pub struct Common {
+    /// A policy image, a run folder, the name of a shipped policy, or a baseline: still, random
+    pub policy: String,
+    /// Episodes to run
+    #[arg(long, default_value_t = 200, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    pub episodes: u64,
+    /// Modules of the snake, 1 to 64 [default: the robot's]
+    #[arg(long)]
+    pub modules: Option<usize>,
+    /// Robot file [default: the paper's 8 x 4 links]
+    #[arg(long, value_name = "FILE")]
+    pub robot: Option<PathBuf>,
+    /// Faults: action:K, observation:K, unplug:K, cut and more; several separated by commas
+    #[arg(long, default_value = "none")]
+    pub fault: FaultPlan,
+    /// Seed of the episodes; training never draws the same ones
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Print one JSON object and nothing else
+    #[arg(long)]
+    pub json: bool,
+    /// Threads [default: one a core]; the result does not depend on it
+    #[arg(long)]
+    pub threads: Option<usize>,
+}
+
+impl Common {
+    /// The robot asked for.
+    pub fn robot(&self) -> Result<Option<Robot>> {
+        let file = self.robot.as_deref().map(Robot::load).transpose()?;
+        match self.modules {
+            None => Ok(file),
+            Some(modules) => Ok(Some(file.unwrap_or_default().with_modules(modules)?)),
+        }
+    }
+
+    /// Faults of an episode.
+    pub fn draw(&self) -> impl Fn(u64, usize) -> Vec<ScheduledFault> + Sync {
+        |seed, modules| self.fault.draw(seed, modules)
+    }
+
+    /// A progress bar over the episodes, hidden when nobody looks.
+    pub fn bar(&self) -> ProgressBar {
+        let bar = if self.json { ProgressBar::hidden() } else { ProgressBar::new(self.episodes) };
+        if let Ok(style) = ProgressStyle::with_template("{msg} [{bar:40}] {pos}/{len} episodes, {eta} left") {
+            bar.set_style(style);
+        }
+        bar.set_message(self.policy.clone());
+        bar
+    }
+}
+
+/// Arguments of `eval`.
+#[derive(clap::Args, Clone, Debug)]
+pub struct Arguments {
+    #[command(flatten)]
+    common: Common,
+}
+
+/// Runs the verb.
+pub fn run(arguments: &Arguments) -> Result<()> {
+    let common = &arguments.common;
+    let source = PolicySource::load(&common.policy)?;
+    let config = Arc::new(source.environment(common.robot()?.as_ref())?);
+    common.fault.check(config.robot.modules)?;
+    if let Some(fault) = common.fault.faults.iter().find(|fault| !knows_fault(&fault.kind)) {
+        bail!("{fault} happens on a bus: `snakectl sil` has one; eval knows action, observation, unplug and cut");
+    }
+    let bar = common.bar();
+    let draw = common.draw();
+    let trial = Trial {
+        config: &config,
+        episodes: common.episodes as usize,
+        seed: common.seed,
+        faults: &draw,
+        threads: common.threads.unwrap_or_else(super::cores),
+    };
+    let report = trial.evaluate(source.pilot()?, &common.fault.to_string(), &|| bar.inc(1));
+    bar.finish_and_clear();
+    if common.json {
+        println!("{}", serde_json::to_string(&report)?);
+    } else {
+        print!("{}", table(&report));
+    }
+    Ok(())
+}
+
+/// The report for people: the paper's three columns, success by bearing, and the motion.
+pub fn table(report: &Report) -> String {
+    let mut text = format!(
+        "{} episodes, {} modules, fault {}\n  success   {:.3} +- {:.3}\n  distance  {:.2} +- {:.2} units\n  steps     {:.1} +- {:.1}\n  ",
+        report.episodes,
+        report.modules,
+        report.fault,
+        report.success_rate,
+        report.success_rate_se,
+        report.distance_mean,
+        report.distance_se,
+        report.steps_mean,
+        report.steps_se
+    );
+    let bearings: Vec<_> = report
+        .by_bearing
+        .iter()
+        .map(|b| format!("{:?} {:.2} ({})", b.bearing, b.success_rate, b.episodes).to_lowercase())
+        .collect();
+    text += &bearings.join("  ");
+    text += &format!(
+        "\n  peak link speed {:.1} units/s, peak height {:.2} units, peak joint speed {:.2} rad/s, below two link diameters in {:.1} % of steps\n",
+        report.peak_link_speed,
+        report.peak_height,
+        report.peak_joint_speed,
+        100.0 * report.low_share
+    );
+    text
+}

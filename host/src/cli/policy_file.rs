@@ -1,0 +1,113 @@
+//! Where a policy comes from: a frozen image, a run folder, or one that ships.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail};
+use composer_shared::policy::{Policy, Task};
+
+use crate::env::EnvConfig;
+use crate::eval::Pilot;
+use crate::network::Network;
+use crate::robot::Robot;
+use crate::run::RunConfig;
+use crate::train::checkpoint;
+
+/// A policy to evaluate or to run.
+pub enum PolicySource {
+    /// A frozen integer policy image.
+    Image(Vec<u8>),
+    /// The float network of a training run, with its settings.
+    Run(Box<(Network, RunConfig)>),
+    /// No policy: baselines.
+    Still,
+    /// No policy: baselines.
+    Random,
+}
+
+impl PolicySource {
+    /// Finds a policy: a file, a run folder, the name of a task whose policy ships, or a baseline (`still`, `random`).
+    pub fn load(name: &str) -> Result<Self> {
+        let path = Path::new(name);
+        if path.is_dir() {
+            let (config, network) = load_run(path)?;
+            return Ok(PolicySource::Run(Box::new((network, config))));
+        }
+        if path.is_file() {
+            let image = std::fs::read(path).with_context(|| format!("cannot read {name}"))?;
+            Policy::parse(&image).map_err(|e| anyhow::anyhow!("{name} is not a usable policy image: {e}"))?;
+            return Ok(PolicySource::Image(image));
+        }
+        match name {
+            "still" => Ok(PolicySource::Still),
+            "random" => Ok(PolicySource::Random),
+            _ => match composer_shared::policies::shipped(name) {
+                Some(image) => Ok(PolicySource::Image(image.to_vec())),
+                None => bail!(
+                    "there is no policy {name}: give an image file, a run folder, still, random, or one that ships ({})",
+                    composer_shared::policies::NAMES.join(", ")
+                ),
+            },
+        }
+    }
+
+    /// The pilot that flies it. The image has been checked when it was loaded.
+    pub fn pilot(&self) -> Result<Pilot<'_>> {
+        Ok(match self {
+            PolicySource::Image(image) => Pilot::Integer(Policy::parse(image).map_err(|e| anyhow::anyhow!("{e}"))?),
+            PolicySource::Run(run) => Pilot::Float(&run.0),
+            PolicySource::Still => Pilot::Still,
+            PolicySource::Random => Pilot::Random,
+        })
+    }
+
+    /// The environment that the policy was made for, on `robot` (default: the one it was trained with, else the paper's).
+    pub fn environment(&self, robot: Option<&Robot>) -> Result<EnvConfig> {
+        match self {
+            PolicySource::Image(image) => {
+                let policy = Policy::parse(image).map_err(|e| anyhow::anyhow!("{e}"))?;
+                let mut config = EnvConfig::new(robot.cloned().unwrap_or_default());
+                check(&policy, &config.robot)?;
+                config.goal_known_to = policy.goal_known_to();
+                config.control_period = policy.control_period_us() as f32 * 1e-6;
+                Ok(config)
+            }
+            PolicySource::Run(run) => {
+                let mut config = run.1.evaluation();
+                if let Some(robot) = robot {
+                    config.robot = robot.clone();
+                }
+                Ok(config)
+            }
+            PolicySource::Still | PolicySource::Random => Ok(EnvConfig::new(robot.cloned().unwrap_or_default())),
+        }
+    }
+}
+
+/// Refuses a policy of another task or of a robot that its modules could not control.
+fn check(policy: &Policy, robot: &Robot) -> Result<()> {
+    if policy.task() != Task::GoalReaching {
+        bail!("the policy was trained for {}; only goal-reaching can be run", policy.task().name());
+    }
+    if policy.geometry() != robot.geometry() || policy.limits() != robot.limits() {
+        bail!(
+            "the policy was trained for modules with {:?} and {:?}; the robot {} has {:?} and {:?}",
+            policy.geometry(),
+            policy.limits(),
+            robot.name,
+            robot.geometry(),
+            robot.limits()
+        );
+    }
+    Ok(())
+}
+
+/// The settings and the network of a run folder.
+pub fn load_run(folder: &Path) -> Result<(RunConfig, Network)> {
+    let path: PathBuf = folder.join("config.toml");
+    let text = std::fs::read_to_string(&path)
+        .with_context(|| format!("{} is no run folder: it has no readable config.toml", folder.display()))?;
+    let config: RunConfig = toml::from_str(&text)
+        .map_err(|e| anyhow::anyhow!("{} does not fit this version: {}", path.display(), e.message()))?;
+    let network = checkpoint::network(folder, config.train.method)?;
+    Ok((config, network))
+}

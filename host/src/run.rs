@@ -1,0 +1,206 @@
+//! Settings of a training run, one TOML document: the learner's, the task's, the faults', the robot's.
+
+use std::sync::Arc;
+
+use anyhow::{Context, Result, bail};
+use composer_shared::policy::{GoalKnownTo, Meta, Task};
+use serde::{Deserialize, Serialize};
+
+use crate::env::{EnvConfig, FaultTraining};
+use crate::robot::Robot;
+use crate::tasks::goal_reaching::GoalReaching;
+use crate::train::TrainConfig;
+
+/// Who is told the goal, in settings files.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Knows {
+    /// Every module (the paper's).
+    #[default]
+    All,
+    /// The head alone, a camera in it, say: attention must carry the goal along.
+    Head,
+}
+
+impl From<Knows> for GoalKnownTo {
+    fn from(knows: Knows) -> Self {
+        match knows {
+            Knows::All => GoalKnownTo::All,
+            Knows::Head => GoalKnownTo::Head,
+        }
+    }
+}
+
+impl From<GoalKnownTo> for Knows {
+    fn from(known: GoalKnownTo) -> Self {
+        match known {
+            GoalKnownTo::All => Knows::All,
+            GoalKnownTo::Head => Knows::Head,
+        }
+    }
+}
+
+/// Settings of the environment that belong to no single task.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct EnvSettings {
+    /// Who is told the goal.
+    pub goal_known_to: Knows,
+    /// Control period, s.
+    pub control_period: f32,
+    /// Physics steps from sampling the sensors to the new torque, least and most, drawn for each episode: a bus delays by one
+    /// or two.
+    pub delay: [usize; 2],
+    /// Lengths to train on, in modules; environments take them in turn. Empty: the robot's own.
+    pub lengths: Vec<usize>,
+}
+
+impl Default for EnvSettings {
+    fn default() -> Self {
+        EnvSettings { goal_known_to: Knows::All, control_period: 0.05, delay: [1, 2], lengths: Vec::new() }
+    }
+}
+
+/// Everything that defines a run.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RunConfig {
+    /// The learner.
+    pub train: TrainConfig,
+    /// The environment.
+    pub env: EnvSettings,
+    /// The task.
+    pub task: GoalReaching,
+    /// Faults drawn in training.
+    pub faults: FaultTraining,
+    /// The robot.
+    pub robot: Robot,
+}
+
+impl RunConfig {
+    /// Changes one setting: `section.key=value`, or `key=value` where only one section has such a key. The value is TOML; a bare word
+    /// is a string.
+    pub fn set(&mut self, assignment: &str) -> Result<()> {
+        let Some((key, value)) = assignment.split_once('=') else {
+            bail!("`{assignment}` is no setting: write key=value, such as train.learning_rate=3e-4");
+        };
+        let (key, value) = (key.trim(), value.trim());
+        let mut document = toml::Table::try_from(&*self).context("the settings cannot be written as TOML")?;
+        let mut places: Vec<(String, String)> = Vec::new();
+        for (section, table) in &document {
+            for name in table.as_table().into_iter().flatten().map(|(name, _)| name) {
+                if key == name || key == format!("{section}.{name}") {
+                    places.push((section.clone(), name.clone()));
+                }
+            }
+        }
+        let (section, name) = match &places[..] {
+            [(section, name)] => (section.clone(), name.clone()),
+            [] => bail!("there is no setting `{key}`; config.toml in any run folder lists them all"),
+            several => bail!(
+                "`{key}` could be {}; say which",
+                several.iter().map(|(s, n)| format!("{s}.{n}")).collect::<Vec<_>>().join(" or ")
+            ),
+        };
+        let old = &document[&section][&name];
+        let mut new = match toml::from_str::<toml::Table>(&format!("x = {value}")) {
+            Ok(mut parsed) => parsed.remove("x").unwrap_or_else(|| toml::Value::String(value.into())),
+            Err(_) => toml::Value::String(value.into()),
+        };
+        // 1 is as good as 1.0 where a number with a point belongs.
+        if let (toml::Value::Float(_), toml::Value::Integer(i)) = (old, &new) {
+            new = toml::Value::Float(*i as f64);
+        }
+        if let Some(table) = document[&section].as_table_mut() {
+            table.insert(name, new);
+        }
+        *self = document
+            .try_into()
+            .map_err(|error| anyhow::anyhow!("{key}={value} is not possible: {}", error.message()))?;
+        Ok(())
+    }
+
+    /// Says what is wrong with the settings, if anything is.
+    pub fn validate(&self) -> Result<()> {
+        self.train.validate()?;
+        self.robot.validate()?;
+        self.task.validate().map_err(anyhow::Error::msg)?;
+        let substeps = self.env.control_period / self.robot.physics_step;
+        if !(1.0..=100.0).contains(&substeps) || (substeps - substeps.round()).abs() > 1e-3 {
+            bail!(
+                "control_period = {}; it must be a whole number of physics steps of {} s",
+                self.env.control_period,
+                self.robot.physics_step
+            );
+        }
+        let [least, most] = self.env.delay;
+        if least > most || most as f32 >= substeps {
+            bail!("delay = [{least}, {most}]; it must rise and stay below the {substeps:.0} physics steps of a control step");
+        }
+        for &modules in &self.env.lengths {
+            self.robot.with_modules(modules)?;
+        }
+        let faults = &self.faults;
+        if !(0.0..=1.0).contains(&faults.probability) || !(0.0..1.0).contains(&faults.missed_latents) {
+            bail!("faults.probability and faults.missed_latents are shares: 0 to 1");
+        }
+        if faults.weights.iter().any(|w| w.is_nan() || *w < 0.0) || faults.weights.iter().sum::<f32>() <= 0.0 {
+            bail!("faults.weights = {:?}; they must be zero or more, one of them above zero", faults.weights);
+        }
+        Ok(())
+    }
+
+    /// The environment that training number `index` works in.
+    pub fn environment(&self, index: usize) -> Result<Arc<EnvConfig>> {
+        let robot = match &self.env.lengths[..] {
+            [] => self.robot.clone(),
+            lengths => self.robot.with_modules(lengths[index % lengths.len()])?,
+        };
+        Ok(Arc::new(EnvConfig { robot, faults: self.faults.clone(), ..self.evaluation() }))
+    }
+
+    /// The environment without the robot's length being varied and without faults: what evaluation starts from.
+    pub fn evaluation(&self) -> EnvConfig {
+        EnvConfig {
+            task: self.task.clone(),
+            goal_known_to: self.env.goal_known_to.into(),
+            control_period: self.env.control_period,
+            delay: [self.env.delay[0]; 2],
+            ..EnvConfig::new(self.robot.clone())
+        }
+    }
+
+    /// What a frozen policy of this run says about itself.
+    pub fn meta(&self) -> Meta {
+        Meta {
+            task: Task::GoalReaching,
+            goal_known_to: self.env.goal_known_to.into(),
+            attention: self.train.method.attention(),
+            trained_with_faults: self.faults.probability > 0.0,
+            geometry: self.robot.geometry(),
+            limits: self.robot.limits(),
+            control_period_us: (self.env.control_period * 1e6).round() as u32,
+            relax_seconds: self.robot.relax_seconds(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn settings_are_found_by_their_name_and_checked() {
+        let mut config = RunConfig::default();
+        config.set("learning_rate=1").unwrap();
+        config.set("task.goal_distance=[4, 15]").unwrap();
+        config.set("goal_known_to=head").unwrap();
+        assert_eq!((config.train.learning_rate, config.task.goal_distance), (1.0, [4.0, 15.0]));
+        assert_eq!(config.env.goal_known_to, Knows::Head);
+        assert!(config.set("nonsense=1").unwrap_err().to_string().contains("no setting `nonsense`"));
+        assert!(config.set("cap=-1").unwrap_err().to_string().contains("cap=-1 is not possible"));
+        assert!(config.set("cap").unwrap_err().to_string().contains("key=value"));
+        config.set("delay=[1, 5]").unwrap();
+        assert!(config.validate().unwrap_err().to_string().contains("delay = [1, 5]"));
+    }
+}

@@ -1,0 +1,24 @@
+//! What the simulated controllers control.
+
+use composer_shared::observation::Sensors;
+use composer_shared::robot::AXES;
+
+/// A robot made of modules, in steps of its own.
+///
+/// Units and frames are those of [`composer_shared::observation`] and [`composer_shared::robot`].
+pub trait Plant {
+    /// Number of modules, 1 to [`composer_shared::robot::MAX_MODULES`].
+    fn modules(&self) -> usize;
+    /// Length of a step, ns.
+    fn step_ns(&self) -> u64;
+    /// What the sensors of `module` read now.
+    fn sensors(&self, module: usize) -> Sensors;
+    /// The goal in the frame of the head link (robot units), as the ground station broadcasts it; none if there is no goal.
+    fn goal(&self) -> Option<[f32; 3]>;
+    /// Sets the torques of `module` (yaw, pitch); they act from the next step on, until set again.
+    fn set_torque(&mut self, module: usize, torque: [f32; AXES]);
+    /// Advances by [`Plant::step_ns`].
+    fn step(&mut self);
+    /// Whether the episode is over (success, or its time is up).
+    fn done(&self) -> bool;
+}
