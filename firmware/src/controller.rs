@@ -21,6 +21,11 @@
 //! A SYNC that got lost on its way to one module costs nothing: if a neighbour's frame of the next cycle is here when the
 //! cycle is overdue, the module starts it too.
 //!
+//! # Joining
+//!
+//! A module listens for one period after power-up before it sends anything. If its number is already taken it hears so, and falls
+//! silent without having disturbed the robot.
+//!
 //! # Goal
 //!
 //! GOAL is given in the frame of the head link, so an old one becomes wrong as the head moves: without a new one it holds for
@@ -314,6 +319,10 @@ pub struct Controller<'a> {
     relax_factor: f32,
 
     now: Micros,
+    /// When the module was switched on.
+    power_up: Micros,
+    /// Nothing is sent in this cycle: the module only listens.
+    quiet: bool,
     failsafe: Failsafe,
     neighbours: Neighbours,
     chain: Chain,
@@ -362,6 +371,8 @@ impl<'a> Controller<'a> {
             limits,
             relax_factor: relax_factor(timing.period_us, policy.relax_seconds()),
             now,
+            power_up: now,
+            quiet: true,
             failsafe: Failsafe::new(limits, config.bus_off, timing.poll_grace_us),
             neighbours: Neighbours::new(config.node, config.modules, timing.dead_after, policy.tag()),
             chain: Chain::new(policy.geometry()),
@@ -551,6 +562,11 @@ impl<'a> Controller<'a> {
         }
     }
 
+    /// Listen before you talk.
+    fn listening(&self) -> bool {
+        self.now.saturating_sub(self.power_up) < self.period()
+    }
+
     fn own(&self) -> usize {
         usize::from(self.config.node)
     }
@@ -630,10 +646,10 @@ impl<'a> Controller<'a> {
         }
     }
 
-    /// A module that is plugged in while the robot is stopped must not move either. Only until its first cycle: later, a neighbour's
+    /// A module that is plugged in while the robot is stopped must not move either. Only until its first action: later, a neighbour's
     /// frame from just before the release would stop it again.
     fn inherit_stop(&mut self, health: Health) {
-        if self.cycle_start.is_none() && health.has(Health::EMERGENCY_STOP) {
+        if self.last_act.is_none() && health.has(Health::EMERGENCY_STOP) {
             self.failsafe.stop();
         }
     }
@@ -786,6 +802,10 @@ impl<'a> Controller<'a> {
         }
 
         self.outbox.latent = None;
+        self.quiet = self.listening();
+        if self.quiet {
+            return;
+        }
         self.outbox.state = Some(State::new(low, self.health(), &sensors.joint_angles));
         if cycle.wrapping_add(u16::from(self.config.node)) % REPORT_EVERY == 0 {
             self.outbox.telemetry = Some(self.telemetry());
@@ -836,7 +856,7 @@ impl<'a> Controller<'a> {
         let goal = self.goal.position.filter(|_| self.uses_goal()).map(Vector3::from);
         let place = place(self.own(), usize::from(self.config.modules));
         let encoded = self.policy.encode(&observe(&self.sample, place, &head, goal));
-        if self.policy.attention() {
+        if self.policy.attention() && !self.quiet {
             self.outbox.pieces_sent = 0;
             self.outbox.latent = Some(LatentMessage {
                 cycle: self.cycle as u8,
@@ -891,6 +911,9 @@ impl<'a> Controller<'a> {
 
     /// Queues a HEARTBEAT: every [`REPORT_EVERY`] periods, and when the faults change, but never more than one a period.
     fn report(&mut self) {
+        if self.listening() {
+            return;
+        }
         let changed = self.faults() != self.faults_told;
         let wait = if changed { self.period() } else { u64::from(REPORT_EVERY) * self.period() };
         if self.last_heartbeat.is_none_or(|last| self.now.saturating_sub(last) >= wait) {

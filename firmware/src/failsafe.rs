@@ -231,7 +231,9 @@ mod tests {
     use super::*;
 
     fn failsafe() -> Failsafe {
-        Failsafe::new(Limits::default(), BusOffPolicy::Recover, 1000)
+        let limits =
+            Limits { torque: 80.0, torque_slew: 800.0, joint_angle: 3.1, temperature: 80.0, ..Limits::default() };
+        Failsafe::new(limits, BusOffPolicy::Recover, 1000)
     }
 
     fn level() -> Sensors {

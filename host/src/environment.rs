@@ -1,50 +1,166 @@
-//! The environment as the learner sees it.
+//! What a learner sees of a robot made of modules, and a trivial such robot to test learners with.
 
-use composer_shared::observation::Observation;
+use composer_shared::observation::{Observation, SIZE};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 
-/// Numbers a module that only the critic sees, in training.
+/// Extra numbers per module that only the critic sees, and only in training (linear velocity, height, fault flags ...).
 pub const PRIVILEGED: usize = 12;
 
-/// One step of a multi-module environment; every list has one entry a module.
-#[derive(Clone, Debug, Default)]
+/// One moment of a multi-module environment as the learner sees it. Every vector has one entry a module, head first.
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct View {
-    /// What each module observes.
+    /// What each module observes, raw (not normalised).
     pub observations: Vec<Observation>,
-    /// What the critic sees besides.
+    /// What only the critic sees, raw.
     pub privileged: Vec<[f32; PRIVILEGED]>,
-    /// `heard[i]` bit `j`: module `i` hears module `j`'s latent. The own bit is implied.
+    /// Bit j of `heard[i]`: module i hears the latent of module j. A module always hears itself; its own bit is implied.
     pub heard: Vec<u64>,
-    /// False: the module is dead, its action has no effect and is left out of the loss.
+    /// False for a dead module: its action has no effect and is left out of the loss.
     pub acts: Vec<bool>,
 }
 
-/// What one step led to.
+impl View {
+    /// Makes room for exactly `modules` modules: zero observations, everybody hears everybody, everybody acts.
+    pub fn clear(&mut self, modules: usize) {
+        let all = if modules >= 64 { u64::MAX } else { (1 << modules) - 1 };
+        self.observations.clear();
+        self.observations.resize(modules, [0.0; SIZE]);
+        self.privileged.clear();
+        self.privileged.resize(modules, [0.0; PRIVILEGED]);
+        self.heard.clear();
+        self.heard.resize(modules, all);
+        self.acts.clear();
+        self.acts.resize(modules, true);
+    }
+}
+
+/// What one step of an environment led to.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Outcome {
     /// Reward of the step, shared by all modules.
     pub reward: f32,
-    /// The episode ended by itself (success).
+    /// The episode ended in a terminal state (such as success): nothing can be earned after it.
     pub terminated: bool,
-    /// The episode was cut at the cap.
+    /// The episode was cut off (time limit): more could have been earned, so the learner bootstraps.
     pub truncated: bool,
-    /// The task is done.
+    /// The task has been solved.
     pub success: bool,
-    /// The task's distance, robot units.
+    /// Distance that is left, in robot units (or whatever the task measures).
     pub distance: f32,
-    /// Control steps since the reset.
+    /// Steps since the reset.
     pub steps: u32,
-    /// Sum of rewards since the reset.
+    /// Sum of the rewards since the reset.
     pub episode_return: f32,
 }
 
-/// A deterministic multi-module environment.
+/// A robot of several modules with a task.
+///
+/// Deterministic: the same seed and the same actions give the same bits. A training run is resumed by that promise alone: its
+/// checkpoint holds the seed of each running episode and the actions taken in it, not the state of any physics.
 pub trait Environment: Send {
-    /// Modules in this environment.
+    /// How many modules there are, the same in every episode.
     fn modules(&self) -> usize;
     /// Starts an episode; everything random in it comes from the seed.
     fn reset(&mut self, seed: u64);
-    /// Fills `view` with the current step.
+    /// Writes what is seen now.
     fn view(&self, view: &mut View);
-    /// Advances by one control step. Actions are normalised torques, clipped here.
+    /// Applies one action per module (unclipped; the environment clips) for one control step.
     fn step(&mut self, actions: &[[f32; 2]]) -> Outcome;
+}
+
+/// Who is told the target of a [`Trivial`] environment.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Told {
+    /// Every module.
+    All,
+    /// Module 0 alone, so that the others must hear it from there.
+    Head,
+}
+
+/// The simplest task that still needs every module: each must output the target that is drawn at reset, and that stands in the first
+/// two fields of the observation of those who are told.
+///
+/// The reward of a step is `1 - mean squared error` over the modules that act, at most 1. An episode has [`Trivial::STEPS`] steps and
+/// ends by truncation. With [`Told::Head`] a team that cannot talk earns at most about 1 - 7/8 * 2 * 0.33 / 2 on average.
+#[derive(Clone, Debug)]
+pub struct Trivial {
+    modules: usize,
+    told: Told,
+    dead: Option<usize>,
+    target: [f32; 2],
+    steps: u32,
+    episode_return: f32,
+}
+
+impl Trivial {
+    /// Steps in an episode.
+    pub const STEPS: u32 = 10;
+
+    /// A team of `modules`, of which those in `told` know the target.
+    pub fn new(modules: usize, told: Told) -> Self {
+        Self { modules, told, dead: None, target: [0.0; 2], steps: 0, episode_return: 0.0 }
+    }
+
+    /// The same with one dead module, which nobody hears and whose action counts for nothing.
+    pub fn with_dead(mut self, module: usize) -> Self {
+        self.dead = Some(module);
+        self
+    }
+}
+
+impl Environment for Trivial {
+    fn modules(&self) -> usize {
+        self.modules
+    }
+
+    fn reset(&mut self, seed: u64) {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        self.target = [rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0)];
+        self.steps = 0;
+        self.episode_return = 0.0;
+    }
+
+    fn view(&self, view: &mut View) {
+        view.clear(self.modules);
+        for module in 0..self.modules {
+            let o = &mut view.observations[module];
+            o[27] = composer_shared::observation::place(module, self.modules);
+            if self.told == Told::All || module == 0 {
+                o[..2].copy_from_slice(&self.target);
+                o[7] = 1.0;
+            }
+            view.privileged[module][..2].copy_from_slice(&self.target);
+        }
+        if let Some(dead) = self.dead {
+            view.acts[dead] = false;
+            for heard in &mut view.heard {
+                *heard &= !(1 << dead);
+            }
+        }
+    }
+
+    fn step(&mut self, actions: &[[f32; 2]]) -> Outcome {
+        let mut error = 0.0;
+        let mut acting = 0.0f32;
+        for (module, action) in actions.iter().enumerate() {
+            if self.dead != Some(module) {
+                acting += 1.0;
+                error += (0..2).map(|i| (action[i].clamp(-1.0, 1.0) - self.target[i]).powi(2)).sum::<f32>() / 2.0;
+            }
+        }
+        let distance = error / acting.max(1.0);
+        let reward = 1.0 - distance;
+        self.steps += 1;
+        self.episode_return += reward;
+        Outcome {
+            reward,
+            terminated: false,
+            truncated: self.steps >= Self::STEPS,
+            success: distance < 0.05,
+            distance,
+            steps: self.steps,
+            episode_return: self.episode_return,
+        }
+    }
 }

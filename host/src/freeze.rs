@@ -340,7 +340,7 @@ mod tests {
             for modules in [1, 8, 11, 64] {
                 let parity = parity(&network, &policy, &steps(seed + 100, 1 + 400 / modules as u64, modules));
                 println!("seed {seed}, {modules} modules, attention {attention}: {parity:?}");
-                assert!(parity.rms < 0.01 && parity.p99 < 0.025 && parity.max < 0.05, "{parity:?}");
+                assert!(parity.rms < 0.01 && parity.p99 < 0.025 && parity.max < 0.04, "{parity:?}");
                 worst = worst.max(parity.max);
             }
         }

@@ -1,11 +1,18 @@
 //! The host of COMPOSER: physics, tasks, training, evaluation, export and the command line.
 
+pub mod cli;
 pub mod env;
 pub mod environment;
 pub mod eval;
+pub mod files;
 pub mod freeze;
+pub mod methods;
 pub mod network;
+pub mod plot;
+pub mod replay;
 pub mod robot;
+pub mod run;
 pub mod sil;
 pub mod sim;
 pub mod tasks;
+pub mod train;

@@ -11,6 +11,7 @@ extern crate std;
 pub mod kinematics;
 pub mod nn;
 pub mod observation;
+pub mod policies;
 pub mod policy;
 pub mod robot;
 pub mod wire;

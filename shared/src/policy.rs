@@ -235,7 +235,8 @@ impl fmt::Display for PolicyError {
             Self::Magic => write!(f, "this is not a policy image: it does not begin with COMPOSER"),
             Self::Version { found } => write!(
                 f,
-                "the policy image has layout version {found}, this build reads version {VERSION}: export the policy again"
+                "the policy image has layout version {found}, this build reads version {VERSION}: \
+                 export the policy again"
             ),
             Self::Dimensions { found } => write!(
                 f,
@@ -661,10 +662,10 @@ fn dot(query: &[i16; KEY], key: &[i8; KEY]) -> i32 {
 }
 
 fn check_input(mean: f32, gain: f32) -> Result<(), PolicyError> {
-    if !(mean >= -1e6 && mean <= 1e6) {
+    if !(-1e6..=1e6).contains(&mean) {
         return Err(PolicyError::Value { field: "input mean", range: "-1000000 to 1000000" });
     }
-    if !(gain >= 0.0 && gain <= 1e9) {
+    if !(0.0..=1e9).contains(&gain) {
         return Err(PolicyError::Value { field: "input gain", range: "0 to 1000000000" });
     }
     Ok(())
@@ -787,11 +788,11 @@ impl<'a> ImageWriter<'a> {
     }
 
     /// Seals the image, or says which of its numbers [`Policy::parse`] would refuse.
-    pub fn finish(mut self) -> Result<(), PolicyError> {
+    pub fn finish(self) -> Result<(), PolicyError> {
         if let Some(error) = self.error {
             return Err(error);
         }
-        seal(&mut self.image);
+        seal(self.image);
         Ok(())
     }
 
@@ -978,7 +979,7 @@ mod tests {
         let mut image = random(3);
         for byte in 0..IMAGE_SIZE {
             // All bits of header and checksum; of the bulk between, one bit a byte.
-            let all = byte < LAYERS_AT || byte >= CRC_AT;
+            let all = !(LAYERS_AT..CRC_AT).contains(&byte);
             for bit in (0..8).filter(|bit| all || byte % 8 == *bit) {
                 image[byte] ^= 1 << bit;
                 assert!(Policy::parse(&image[..]).is_err(), "byte {byte} bit {bit}");

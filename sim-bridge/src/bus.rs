@@ -602,6 +602,11 @@ impl Bus {
         }
     }
 
+    /// How many cuts there are between the first node and this one: the number of its piece of cable.
+    pub fn cuts_before(&self, node: usize) -> u32 {
+        (self.cuts & (bit(node) - 1)).count_ones()
+    }
+
     /// When something happens next, ns; `u64::MAX` if nothing will.
     pub fn next_event_ns(&self) -> u64 {
         if !self.events.is_empty() {
@@ -828,7 +833,8 @@ impl Bus {
     }
 
     fn occupy(&mut self, index: usize, sof: u64, end: u64, outcome: Outcome) {
-        let (Outcome::Delivered { transmitters, losers, .. } | Outcome::Destroyed { transmitters, losers, .. }) = outcome;
+        let (Outcome::Delivered { transmitters, losers, .. } | Outcome::Destroyed { transmitters, losers, .. }) =
+            outcome;
         for node in nodes(transmitters | losers) {
             let slot = &mut self.nodes[node];
             slot.sending = slot.candidate(sof + self.bit_ns).and_then(|(_, order)| order);
@@ -1149,11 +1155,8 @@ mod tests {
         assert_eq!(bus.counters(0), counters(128, 0));
         let states: Vec<_> = events.iter().filter(|event| matches!(event, Event::State { .. })).collect();
         assert!(matches!(states[..], [Event::State { state: ErrorState::Passive, .. }]));
-        let errors: Vec<u64> = events
-            .iter()
-            .filter(|event| matches!(event, Event::ErrorFrame { .. }))
-            .map(Event::at_ns)
-            .collect();
+        let errors: Vec<u64> =
+            events.iter().filter(|event| matches!(event, Event::ErrorFrame { .. })).map(Event::at_ns).collect();
         // Up to the acknowledgement slot, 6 bits of flag, 8 of delimiter; then 3 of intermission, and 8 of suspend once passive.
         let stream = BitStream::new(&frame(0x100, 0));
         let attempt = (stream.ack as u64 + 1 + 6 + 8 + 3) * BIT;
@@ -1464,7 +1467,10 @@ mod tests {
         let errors = events.iter().filter(|event| matches!(event, Event::ErrorFrame { .. })).count();
         assert_eq!(errors, 2, "one on each side");
         assert_eq!(delivered(&events).iter().map(|d| d.2).collect::<Vec<_>>(), [0b0001]);
-        assert_eq!([0, 1, 2, 3].map(|n| bus.counters(n)), [counters(0, 0), counters(7, 0), counters(0, 1), counters(0, 1)]);
+        assert_eq!(
+            [0, 1, 2, 3].map(|n| bus.counters(n)),
+            [counters(0, 0), counters(7, 0), counters(0, 1), counters(0, 1)]
+        );
     }
 
     #[test]

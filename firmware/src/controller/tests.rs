@@ -116,7 +116,7 @@ impl Net {
         if let Some(controller) = &mut self.nodes[node] {
             let outputs = controller.poll(self.now, &self.sensors[node], frame, self.status[node]);
             assert!(outputs.deadline > self.now);
-            assert!(outputs.torque.iter().all(|t| t.abs() <= 80.0));
+            assert!(outputs.torque.iter().all(|t| t.abs() <= self.policy.limits().torque));
             assert!(outputs.motors_enabled || outputs.torque == [0.0; 2]);
             self.outputs[node] = outputs;
         }
@@ -250,7 +250,7 @@ fn the_torques_are_those_of_the_training_loop_to_the_last_bit() {
                 sensors.joint_angles = core::array::from_fn(|j| libm::sinf(x + j as f32));
                 sensors.joint_speeds = core::array::from_fn(|j| libm::cosf(x * j as f32));
                 sensors.angular_rate = [libm::sinf(3.0 * x), 0.1, -0.2];
-                sensors.torque = torques[i].map(|t| t / 80.0);
+                sensors.torque = torques[i].map(|t| t / policy.limits().torque);
             }
             // Module 2's accelerometer dies on the way.
             net.sensors[2].up = if cycle > 15 { [0.0; 3] } else { [0.0, 0.0, 1.0] };
@@ -683,7 +683,8 @@ fn an_emergency_stop_latches_in_the_same_poll_until_the_station_releases_it() {
     assert!(net.outputs.iter().all(|o| !o.motors_enabled), "motors start with the next action, from zero");
     net.run(PERIOD);
     net.assert_in_step();
-    assert!(net.outputs.iter().all(|o| o.motors_enabled && o.torque.iter().all(|t| t.abs() <= 40.0)));
+    let step = net.policy.limits().torque_slew * 0.05;
+    assert!(net.outputs.iter().all(|o| o.motors_enabled && o.torque.iter().all(|t| t.abs() <= step)));
 }
 
 #[test]
@@ -718,20 +719,41 @@ fn a_hung_processor_latches_the_watchdog() {
     assert!(net.outputs[2].motors_enabled);
 }
 
+/// Makes the controller in slot `slot` one that believes to be `node`.
+fn twin(net: &mut Net, slot: usize, node: u8) {
+    let config = Config::new(node, 8, BusKind::Fd, &net.policy);
+    net.nodes[slot] = Some(Controller::new(config, net.policy, net.now).unwrap());
+    net.outputs[slot].deadline = net.now;
+}
+
 #[test]
-fn two_modules_with_one_number_relax_and_fall_silent() {
+fn a_newcomer_with_a_number_that_is_taken_falls_silent_and_disturbs_nobody() {
+    for wait in [0, 13_000, 49_999] {
+        let mut net = Net::eight();
+        net.unplug(5);
+        net.run(SECOND + wait);
+        let sent = net.log.len();
+        twin(&mut net, 5, 3);
+        net.run(SECOND);
+        assert_eq!((net.at(5).faults().number(), net.outputs[5].motors_enabled), (35, false));
+        net.unplug(5);
+        net.assert_in_step();
+        assert_eq!(net.at(0).heard(), 0xdf);
+        // Nobody sent twice under one identifier within a cycle.
+        let states: Vec<_> = net.log[sent..].iter().filter(|(_, f)| f.id == Function::State.id(3)).collect();
+        assert!(states.windows(2).all(|s| s[1].0 - s[0].0 > PERIOD / 2));
+    }
+}
+
+#[test]
+fn two_modules_with_one_number_from_power_up_relax_and_fall_silent() {
     let mut net = Net::eight();
-    net.run(SECOND);
-    // Module 5's twin is already there, under the number 3.
-    let config = Config::new(3, 8, BusKind::Fd, &net.policy);
-    net.nodes[5] = Some(Controller::new(config, net.policy, net.now).unwrap());
-    net.outputs[5].deadline = net.now;
-    net.run(SECOND);
+    twin(&mut net, 5, 3);
+    net.run(2 * SECOND);
     for i in [3, 5] {
         assert_eq!((net.at(i).faults().number(), net.outputs[i].motors_enabled), (35, false));
     }
-    let last = net.log.iter().filter(|(_, f)| f.module() == 3).map(|(t, _)| *t).max().unwrap();
-    assert!(last < SECOND + 3 * PERIOD);
+    assert!(net.log.iter().filter(|(_, f)| f.module() == 3).count() < 10);
     assert_eq!((net.at(0).heard(), net.time_keeper()), (0xd7, Some(0)));
     // A release does not help; numbering one of them anew and restarting does.
     net.station_says(StopCommand::Release);
@@ -900,12 +922,13 @@ proptest! {
         ),
     ) {
         let policy = policy(3, &[]);
+        let limits = policy.limits();
         let bus = if classic { BusKind::Classic } else { BusKind::Fd };
         let mut module = Controller::new(Config::new(2, 5, bus, &policy), policy, start).unwrap();
         let (mut now, mut latest) = (start, start);
         let mut sensors = level();
         let mut last = [0.0f32; 2];
-        let mut last_change = start;
+        let (mut last_act, mut acted) = (start, 0);
         for (step, frame, new_sensors, status) in steps {
             // Sometimes a wild jump, also backwards.
             now = if step > 60_000 { step } else { now.saturating_add(step) };
@@ -917,18 +940,23 @@ proptest! {
             prop_assert!(outputs.deadline <= latest.saturating_add(PERIOD));
             prop_assert!(outputs.motors_enabled || outputs.torque == [0.0; 2]);
             for (torque, last) in outputs.torque.iter().zip(last) {
-                prop_assert!(torque.abs() <= 80.0);
+                prop_assert!(torque.abs() <= limits.torque);
                 // Away from zero never faster than the slew limit; a relaxed motor drops to zero at once.
                 if torque.abs() > last.abs() {
-                    let time = (latest - last_change).min(PERIOD).max(if last_change == start { PERIOD } else { 0 });
+                    // (Two actions three quarters of a period apart count as a whole period apart.)
+                    let time = match latest - last_act {
+                        t if last_act == start || t >= PERIOD / 4 * 3 => PERIOD,
+                        t => t,
+                    };
                     let step = (torque - last).abs();
-                    prop_assert!(step <= 800.0 * PERIOD as f32 / 1e6 + 1e-3, "{step} in {time} us");
+                    prop_assert!(step <= limits.torque_slew * time as f32 / 1e6 + 1e-3, "{step} in {time} us");
                 }
             }
-            if outputs.torque != last {
-                last = outputs.torque;
-                last_change = latest;
+            if module.stats().acted != acted {
+                acted = module.stats().acted;
+                last_act = latest;
             }
+            last = outputs.torque;
             let frames: Vec<_> = core::iter::from_fn(|| module.next_frame()).take(20).collect();
             prop_assert!(frames.len() < 15);
             for frame in frames {

@@ -1,6 +1,6 @@
 //! Where a policy comes from: a frozen image, a run folder, or one that ships.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Context, Result, bail};
 use composer_shared::policy::{Policy, Task};
@@ -10,7 +10,6 @@ use crate::eval::Pilot;
 use crate::network::Network;
 use crate::robot::Robot;
 use crate::run::RunConfig;
-use crate::train::checkpoint;
 
 /// A policy to evaluate or to run.
 pub enum PolicySource {
@@ -101,13 +100,26 @@ fn check(policy: &Policy, robot: &Robot) -> Result<()> {
     Ok(())
 }
 
+/// Settings of a run, in its folder.
+pub const CONFIG_FILE: &str = "config.toml";
+/// Float network of a run as of its last evaluation, in its folder.
+pub const NETWORK_FILE: &str = "network.json";
+
+/// Reads a settings file.
+pub fn load_config(path: &Path) -> Result<RunConfig> {
+    let text = std::fs::read_to_string(path).with_context(|| format!("cannot read the settings {}", path.display()))?;
+    toml::from_str(&text).map_err(|e| anyhow::anyhow!("{} has settings that do not fit: {}", path.display(), e.message()))
+}
+
 /// The settings and the network of a run folder.
 pub fn load_run(folder: &Path) -> Result<(RunConfig, Network)> {
-    let path: PathBuf = folder.join("config.toml");
-    let text = std::fs::read_to_string(&path)
-        .with_context(|| format!("{} is no run folder: it has no readable config.toml", folder.display()))?;
-    let config: RunConfig = toml::from_str(&text)
-        .map_err(|e| anyhow::anyhow!("{} does not fit this version: {}", path.display(), e.message()))?;
-    let network = checkpoint::network(folder, config.train.method)?;
+    let config = load_config(&folder.join(CONFIG_FILE))
+        .with_context(|| format!("{} is no folder of a training run", folder.display()))?;
+    let path = folder.join(NETWORK_FILE);
+    let text = std::fs::read(&path).with_context(|| {
+        format!("cannot read {}; a run writes it at its first evaluation and at its end", path.display())
+    })?;
+    let network: Network = serde_json::from_slice(&text).with_context(|| format!("{} is damaged", path.display()))?;
+    network.check().with_context(|| format!("{} is damaged", path.display()))?;
     Ok((config, network))
 }

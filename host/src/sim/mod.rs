@@ -420,7 +420,7 @@ mod tests {
             let error = (0..3).map(|i| (through_chain[i] - truth[i]).abs()).fold(0.0, f32::max);
             let distance = truth.iter().map(|v| v * v).sum::<f32>().sqrt();
             // The chain assumes perfect hinges; under full torque the solver lets them give a little.
-            assert!(error < 0.01 * distance, "module {module}: {through_chain:?} against {truth:?}");
+            assert!(error < 0.02 * distance, "module {module}: {through_chain:?} against {truth:?}");
         }
     }
 }

@@ -1,0 +1,177 @@
+//! Running statistics: of the observations (shared by all modules) and of the returns.
+
+/// Smallest standard deviation that is divided by. A field that hardly ever changes must not be blown up to the size of the others.
+const STD_FLOOR: f64 = 1e-2;
+
+/// Mean and variance of a vector, exact over everything seen, summed in double precision.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Running {
+    count: f64,
+    mean: Vec<f64>,
+    /// Sum of the squared distances from the mean.
+    spread: Vec<f64>,
+}
+
+impl Running {
+    /// Nothing seen of a vector of `size` numbers.
+    pub fn new(size: usize) -> Self {
+        Self { count: 0.0, mean: vec![0.0; size], spread: vec![0.0; size] }
+    }
+
+    /// Takes in one vector (Welford).
+    pub fn push(&mut self, x: &[f32]) {
+        self.count += 1.0;
+        let share = 1.0 / self.count;
+        for ((x, mean), spread) in x.iter().zip(&mut self.mean).zip(&mut self.spread) {
+            let x = f64::from(*x);
+            let delta = x - *mean;
+            *mean += delta * share;
+            *spread += delta * (x - *mean);
+        }
+    }
+
+    /// Takes in all that another has seen (Chan et al.).
+    pub fn merge(&mut self, other: &Running) {
+        if other.count == 0.0 {
+            return;
+        }
+        let total = self.count + other.count;
+        let of_other = other.count / total;
+        for i in 0..self.mean.len() {
+            let delta = other.mean[i] - self.mean[i];
+            self.mean[i] += delta * of_other;
+            self.spread[i] += other.spread[i] + delta * delta * self.count * of_other;
+        }
+        self.count = total;
+    }
+
+    /// All numbers it is made of; [`Running::from_numbers`] takes them back.
+    pub fn numbers(&self) -> impl Iterator<Item = f64> {
+        std::iter::once(self.count).chain(self.mean.iter().copied()).chain(self.spread.iter().copied())
+    }
+
+    /// Takes `2 size + 1` numbers off the front of a list.
+    pub fn from_numbers(size: usize, numbers: &mut impl Iterator<Item = f64>) -> Option<Self> {
+        let count = numbers.next()?;
+        let mean = (0..size).map(|_| numbers.next()).collect::<Option<_>>()?;
+        let spread = (0..size).map(|_| numbers.next()).collect::<Option<_>>()?;
+        Some(Self { count, mean, spread })
+    }
+
+    /// How many vectors have been seen.
+    pub fn count(&self) -> f64 {
+        self.count
+    }
+
+    /// Mean of each number; 0 before anything is seen.
+    pub fn mean<const N: usize>(&self) -> [f32; N] {
+        std::array::from_fn(|i| self.mean[i] as f32)
+    }
+
+    /// Standard deviation of each number, at least 0.01; 1 before anything is seen.
+    pub fn std<const N: usize>(&self) -> [f32; N] {
+        std::array::from_fn(|i| {
+            if self.count < 1.0 { 1.0 } else { (self.spread[i] / self.count).sqrt().max(STD_FLOOR) as f32 }
+        })
+    }
+}
+
+/// Running mean and standard deviation of the returns, so that the critic learns numbers of size 1 (PopArt, van Hasselt et al. 2016).
+///
+/// Old iterations fade: returns grow while the policy gets better.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ValueNorm {
+    mean: f64,
+    square: f64,
+    weight: f64,
+}
+
+impl ValueNorm {
+    /// What is left of an iteration's weight when the next one comes in.
+    const DECAY: f64 = 0.95;
+
+    /// Takes in the returns of an iteration.
+    pub fn update(&mut self, returns: &[f32]) {
+        if returns.is_empty() {
+            return;
+        }
+        let n = returns.len() as f64;
+        let mean = returns.iter().map(|r| f64::from(*r)).sum::<f64>() / n;
+        let square = returns.iter().map(|r| f64::from(*r).powi(2)).sum::<f64>() / n;
+        self.mean = Self::DECAY * self.mean + (1.0 - Self::DECAY) * mean;
+        self.square = Self::DECAY * self.square + (1.0 - Self::DECAY) * square;
+        self.weight = Self::DECAY * self.weight + (1.0 - Self::DECAY);
+    }
+
+    /// All numbers it is made of; [`ValueNorm::from_numbers`] takes them back.
+    pub fn numbers(&self) -> [f64; 3] {
+        [self.mean, self.square, self.weight]
+    }
+
+    /// Takes three numbers off the front of a list.
+    pub fn from_numbers(numbers: &mut impl Iterator<Item = f64>) -> Option<Self> {
+        Some(Self { mean: numbers.next()?, square: numbers.next()?, weight: numbers.next()? })
+    }
+
+    /// Mean of the returns; 0 before any were seen.
+    pub fn mean(&self) -> f32 {
+        if self.weight == 0.0 { 0.0 } else { (self.mean / self.weight) as f32 }
+    }
+
+    /// Standard deviation of the returns, at least 0.01; 1 before any were seen.
+    pub fn std(&self) -> f32 {
+        if self.weight == 0.0 {
+            return 1.0;
+        }
+        let mean = self.mean / self.weight;
+        (self.square / self.weight - mean * mean).max(STD_FLOOR * STD_FLOOR).sqrt() as f32
+    }
+
+    /// From the critic's scale to the reward's.
+    pub fn denormalise(&self, value: f32) -> f32 {
+        value * self.std() + self.mean()
+    }
+
+    /// From the reward's scale to the critic's.
+    pub fn normalise(&self, value: f32) -> f32 {
+        (value - self.mean()) / self.std()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn merging_parts_equals_seeing_the_whole() {
+        let rows: Vec<[f32; 2]> = (0..50).map(|i| [i as f32 * 0.5 - 3.0, (i as f32).sin() * 10.0]).collect();
+        let mut whole = Running::new(2);
+        rows.iter().for_each(|row| whole.push(row));
+        let mut merged = Running::new(2);
+        for part in [&rows[..13], &rows[13..13], &rows[13..]] {
+            let mut running = Running::new(2);
+            part.iter().for_each(|row| running.push(row));
+            merged.merge(&running);
+        }
+        assert_eq!(merged.count(), 50.0);
+        let (a, b): ([f32; 2], [f32; 2]) = (whole.mean(), merged.mean());
+        let (c, d): ([f32; 2], [f32; 2]) = (whole.std(), merged.std());
+        for i in 0..2 {
+            assert!((a[i] - b[i]).abs() < 1e-5 && (c[i] - d[i]).abs() < 1e-5);
+        }
+        assert!((a[0] - 9.25).abs() < 1e-5);
+        assert!((c[0] - 7.2154).abs() < 1e-3);
+    }
+
+    #[test]
+    fn returns_come_back_from_the_critics_scale() {
+        let mut norm = ValueNorm::default();
+        assert_eq!(norm.normalise(3.0), 3.0);
+        norm.update(&[8.0, 12.0]);
+        assert!((norm.mean() - 10.0).abs() < 1e-5 && (norm.std() - 2.0).abs() < 1e-5);
+        assert!((norm.denormalise(norm.normalise(11.5)) - 11.5).abs() < 1e-5);
+        norm.update(&[18.0, 22.0]);
+        // The newer iteration weighs 1 / 0.95 of the older.
+        assert!((norm.mean() - (9.5 + 20.0) / 1.95).abs() < 1e-4);
+    }
+}

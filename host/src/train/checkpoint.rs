@@ -1,0 +1,248 @@
+//! The checkpoint: one file with all that a run needs to go on bit for bit.
+//!
+//! Layout, little-endian: magic `CMPSRCK1`, then fields as written by [`Checkpoint::encode`], then the CRC-32 of everything before.
+//! A new one is written beside the old one, made durable and renamed, so that there is a whole one at every moment.
+
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::Path;
+
+use thiserror::Error;
+
+use crate::methods::actor_critic::OUT;
+
+/// File name of the checkpoint in the folder of a run.
+pub const FILE: &str = "checkpoint.bin";
+/// Where a new checkpoint is written before it replaces the old one.
+const TEMPORARY: &str = "checkpoint.tmp";
+
+const MAGIC: &[u8; 8] = b"CMPSRCK1";
+const CRC: crc::Crc<u32> = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC);
+
+/// Why a checkpoint was not read or written.
+#[derive(Debug, Error)]
+pub enum CheckpointError {
+    /// No such file.
+    #[error("{0} holds no checkpoint to resume from ({FILE} is missing)")]
+    Missing(String),
+    /// The file could not be read.
+    #[error("the checkpoint {0} cannot be read: {1}")]
+    Read(String, io::Error),
+    /// Not a checkpoint.
+    #[error("{0} is no training checkpoint of this program (it does not start with CMPSRCK1)")]
+    Magic(String),
+    /// Damaged.
+    #[error("the checkpoint {0} is damaged (its checksum is wrong); it cannot be resumed from")]
+    Damaged(String),
+    /// The file could not be written.
+    #[error("no checkpoint can be written to {0}: {1}. Training stops here; what the folder held before is untouched")]
+    Write(String, io::Error),
+}
+
+/// A running episode of one environment: replaying its actions after the reset leads back to where it was.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Episode {
+    /// Its number, which gives its seed.
+    pub number: u64,
+    /// Actions since the reset.
+    pub actions: Vec<[f32; OUT]>,
+}
+
+/// The state of a run between two iterations.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Checkpoint {
+    /// The settings, as TOML.
+    pub config: String,
+    /// What the run trains for: robot and task, in the caller's words.
+    pub fingerprint: String,
+    /// Iterations done.
+    pub iteration: u64,
+    /// Steps taken by the actor's and the critic's optimiser.
+    pub adam_steps: [u64; 2],
+    /// Parameters, then both moments of Adam: of the actor, then of the critic.
+    pub parameters: [Vec<f32>; 6],
+    /// Statistics: whatever numbers the normalisers are made of.
+    pub statistics: Vec<f64>,
+    /// One entry per environment.
+    pub episodes: Vec<Episode>,
+}
+
+impl Checkpoint {
+    fn encode(&self) -> Vec<u8> {
+        let mut out = MAGIC.to_vec();
+        let number = |out: &mut Vec<u8>, n: u64| out.extend_from_slice(&n.to_le_bytes());
+        for text in [&self.config, &self.fingerprint] {
+            number(&mut out, text.len() as u64);
+            out.extend_from_slice(text.as_bytes());
+        }
+        number(&mut out, self.iteration);
+        self.adam_steps.iter().for_each(|steps| number(&mut out, *steps));
+        for parameters in &self.parameters {
+            number(&mut out, parameters.len() as u64);
+            parameters.iter().for_each(|p| out.extend_from_slice(&p.to_le_bytes()));
+        }
+        number(&mut out, self.statistics.len() as u64);
+        self.statistics.iter().for_each(|s| out.extend_from_slice(&s.to_le_bytes()));
+        number(&mut out, self.episodes.len() as u64);
+        for episode in &self.episodes {
+            number(&mut out, episode.number);
+            number(&mut out, episode.actions.len() as u64);
+            episode.actions.as_flattened().iter().for_each(|a| out.extend_from_slice(&a.to_le_bytes()));
+        }
+        out.extend_from_slice(&CRC.checksum(&out).to_le_bytes());
+        out
+    }
+
+    /// None if a length does not fit: with a right checksum that happens only to a file of another program.
+    fn decode(body: &[u8]) -> Option<Self> {
+        let mut reader = Reader(body);
+        let mut checkpoint = Self { config: reader.text()?, fingerprint: reader.text()?, ..Self::default() };
+        checkpoint.iteration = reader.number()?;
+        checkpoint.adam_steps = [reader.number()?, reader.number()?];
+        for parameters in &mut checkpoint.parameters {
+            *parameters = reader.floats(1)?;
+        }
+        let count = reader.length(8)?;
+        checkpoint.statistics = (0..count).map(|_| reader.number().map(f64::from_bits)).collect::<Option<_>>()?;
+        let count = reader.length(16)?;
+        for _ in 0..count {
+            let number = reader.number()?;
+            let actions = reader.floats(OUT)?.chunks_exact(OUT).map(|pair| std::array::from_fn(|i| pair[i])).collect();
+            checkpoint.episodes.push(Episode { number, actions });
+        }
+        reader.0.is_empty().then_some(checkpoint)
+    }
+
+    /// Reads the checkpoint of a run.
+    pub fn read(folder: &Path) -> Result<Self, CheckpointError> {
+        let path = folder.join(FILE);
+        let name = path.display().to_string();
+        let bytes = match fs::read(&path) {
+            Ok(bytes) => bytes,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {
+                return Err(CheckpointError::Missing(folder.display().to_string()));
+            }
+            Err(error) => return Err(CheckpointError::Read(name, error)),
+        };
+        let Some(body) = bytes.strip_prefix(MAGIC) else { return Err(CheckpointError::Magic(name)) };
+        let Some((body, checksum)) = body.split_last_chunk::<4>() else { return Err(CheckpointError::Damaged(name)) };
+        if CRC.checksum(&bytes[..bytes.len() - 4]) != u32::from_le_bytes(*checksum) {
+            return Err(CheckpointError::Damaged(name));
+        }
+        Self::decode(body).ok_or(CheckpointError::Damaged(name))
+    }
+
+    /// Writes the checkpoint of a run. If that fails, the one before it is still there.
+    pub fn write(&self, folder: &Path) -> Result<(), CheckpointError> {
+        let temporary = folder.join(TEMPORARY);
+        let write = || -> io::Result<()> {
+            let mut file = File::create(&temporary)?;
+            file.write_all(&self.encode())?;
+            file.sync_all()?;
+            fs::rename(&temporary, folder.join(FILE))?;
+            // The rename itself must reach the disk, too.
+            File::open(folder)?.sync_all()
+        };
+        write().map_err(|error| {
+            // Nothing more can be done if even that fails; the next checkpoint writes over it.
+            let _ = fs::remove_file(&temporary);
+            CheckpointError::Write(folder.display().to_string(), error)
+        })
+    }
+}
+
+struct Reader<'a>(&'a [u8]);
+
+impl Reader<'_> {
+    fn number(&mut self) -> Option<u64> {
+        let (bytes, rest) = self.0.split_first_chunk::<8>()?;
+        self.0 = rest;
+        Some(u64::from_le_bytes(*bytes))
+    }
+
+    /// A count of things of `size` bytes each, which must still be there.
+    fn length(&mut self, size: usize) -> Option<usize> {
+        let count = usize::try_from(self.number()?).ok()?;
+        (count.checked_mul(size)? <= self.0.len()).then_some(count)
+    }
+
+    fn take(&mut self, bytes: usize) -> Option<&[u8]> {
+        let (taken, rest) = self.0.split_at_checked(bytes)?;
+        self.0 = rest;
+        Some(taken)
+    }
+
+    fn text(&mut self) -> Option<String> {
+        let length = self.length(1)?;
+        String::from_utf8(self.take(length)?.to_vec()).ok()
+    }
+
+    /// A counted list of `width` floats each.
+    fn floats(&mut self, width: usize) -> Option<Vec<f32>> {
+        let count = self.length(4 * width)?;
+        let bytes = self.take(4 * width * count)?;
+        Some(bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn example() -> Checkpoint {
+        Checkpoint {
+            config: "seed = 1".into(),
+            fingerprint: "snake".into(),
+            iteration: 3,
+            adam_steps: [7, 8],
+            parameters: std::array::from_fn(|i| vec![0.1 * i as f32, f32::MIN_POSITIVE, -0.0]),
+            statistics: vec![1.0 / 3.0, f64::EPSILON],
+            episodes: vec![
+                Episode { number: 5, actions: vec![[0.1, -7.5], [1e-30, 2.0]] },
+                Episode { number: 0, actions: vec![] },
+            ],
+        }
+    }
+
+    #[test]
+    fn comes_back_as_it_was() {
+        let folder = tempfile::tempdir().unwrap();
+        example().write(folder.path()).unwrap();
+        assert_eq!(Checkpoint::read(folder.path()).unwrap(), example());
+        assert!(!folder.path().join(TEMPORARY).exists());
+    }
+
+    #[test]
+    fn every_flipped_bit_and_every_cut_is_noticed() {
+        let folder = tempfile::tempdir().unwrap();
+        let whole = example().encode();
+        let path = folder.path().join(FILE);
+        for i in 0..whole.len() {
+            let mut bytes = whole.clone();
+            bytes[i] ^= 1 << (i % 8);
+            fs::write(&path, &bytes).unwrap();
+            let error = Checkpoint::read(folder.path()).unwrap_err();
+            assert_eq!(matches!(error, CheckpointError::Magic(_)), i < 8, "byte {i}: {error}");
+            fs::write(&path, &whole[..i]).unwrap();
+            assert!(Checkpoint::read(folder.path()).is_err(), "cut to {i} bytes");
+        }
+    }
+
+    #[test]
+    fn a_missing_one_is_said_to_be_missing() {
+        let folder = tempfile::tempdir().unwrap();
+        let error = Checkpoint::read(folder.path()).unwrap_err().to_string();
+        assert!(error.contains("holds no checkpoint"), "{error}");
+    }
+
+    #[test]
+    fn a_failed_write_leaves_the_old_one() {
+        let folder = tempfile::tempdir().unwrap();
+        example().write(folder.path()).unwrap();
+        // A folder where the temporary file should go makes the write fail for any user, root among them.
+        fs::create_dir(folder.path().join(TEMPORARY)).unwrap();
+        let error = Checkpoint { iteration: 4, ..example() }.write(folder.path()).unwrap_err().to_string();
+        assert!(error.contains("Training stops here"), "{error}");
+        assert_eq!(Checkpoint::read(folder.path()).unwrap().iteration, 3);
+    }
+}

@@ -1,0 +1,605 @@
+//! The training loop: collect, learn, log, save, until the steps are used up or somebody presses Ctrl-C.
+
+pub mod checkpoint;
+pub mod metrics;
+pub mod progress;
+pub mod tensorboard;
+
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, bail};
+use composer_shared::observation::SIZE;
+use serde::{Deserialize, Serialize};
+
+use self::checkpoint::{Checkpoint, Episode};
+use self::metrics::Metrics;
+use self::progress::{Progress, Times};
+use crate::environment::{Environment, PRIVILEGED};
+use crate::methods::Method;
+use crate::methods::actor_critic::ActorLayout;
+use crate::methods::buffer::Lane;
+use crate::methods::inference::Inference;
+use crate::methods::normalise::{Running, ValueNorm};
+use crate::methods::ppo::{Learner, PpoSettings, update};
+use crate::methods::rollout::{Frozen, Iteration, Slot, collect};
+use crate::network::Network;
+
+/// Settings of a training run. Every field has a default; TOML files and `--set key=value` change single ones.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TrainConfig {
+    /// How the policy is built and trained.
+    pub method: Method,
+    /// Seed of the run: same seed, same policy, bit for bit.
+    pub seed: u64,
+    /// Environment steps (control steps of one snake) in all.
+    pub total_steps: u64,
+    /// Environments side by side.
+    pub environments: usize,
+    /// Steps each takes in an iteration.
+    pub rollout_steps: usize,
+    /// Minibatches an epoch.
+    pub minibatches: usize,
+    /// Epochs of the actor at most; [`TrainConfig::kl_stop`] may end them.
+    pub epochs: usize,
+    /// Epochs of the critic.
+    pub critic_epochs: usize,
+    /// Discount per control step, 0 to 1. Higher looks further ahead and learns slower.
+    pub gamma: f32,
+    /// Decay of generalised advantage estimation, 0 to 1.
+    pub lambda: f32,
+    /// Ratios of new to old density count up to 1 +- this.
+    pub clip: f32,
+    /// Estimated KL divergence at which the actor stops learning from an iteration.
+    pub kl_stop: f32,
+    /// Adam's learning rate at the start.
+    pub learning_rate: f32,
+    /// Share of it that is left at the end; linear in between.
+    pub learning_rate_end: f32,
+    /// Adam's epsilon.
+    pub adam_epsilon: f32,
+    /// Limit of the norm of the actor's gradient, over all its parameters.
+    pub actor_grad_norm: f32,
+    /// The same for the critic.
+    pub critic_grad_norm: f32,
+    /// Weight of the entropy bonus.
+    pub entropy: f32,
+    /// Standard deviation of the actions at the start, as a fraction of the torque limit.
+    pub sigma: f32,
+    /// Environment steps between two evaluations; 0 for none.
+    pub evaluate_every: u64,
+    /// Seconds between two checkpoints.
+    pub checkpoint_seconds: f64,
+    /// Threads; 0 for one per core. The result does not depend on it.
+    pub threads: usize,
+}
+
+impl Default for TrainConfig {
+    fn default() -> Self {
+        Self {
+            method: Method::ComposerNoImagination,
+            seed: 1,
+            total_steps: 1_000_000,
+            environments: 32,
+            rollout_steps: 64,
+            minibatches: 4,
+            epochs: 5,
+            critic_epochs: 5,
+            gamma: 0.97,
+            lambda: 0.95,
+            clip: 0.2,
+            kl_stop: 0.03,
+            learning_rate: 5e-4,
+            learning_rate_end: 0.1,
+            adam_epsilon: 1e-5,
+            actor_grad_norm: 0.5,
+            critic_grad_norm: 1.0,
+            entropy: 0.0,
+            sigma: 0.45,
+            evaluate_every: 100_000,
+            checkpoint_seconds: 60.0,
+            threads: 0,
+        }
+    }
+}
+
+impl TrainConfig {
+    /// Changes one setting, as `--set key=value` does. The value is TOML; a bare word counts as a string.
+    pub fn set(&mut self, assignment: &str) -> Result<()> {
+        let Some((key, value)) = assignment.split_once('=') else {
+            bail!("`{assignment}` is no setting: write key=value, such as learning_rate=3e-4");
+        };
+        let (key, value) = (key.trim(), value.trim());
+        let mut table = toml::Table::try_from(&*self).context("the settings cannot be written as TOML")?;
+        let Some(old) = table.get(key) else {
+            let keys: Vec<_> = table.keys().map(String::as_str).collect();
+            bail!("there is no setting `{key}`; the settings are {}", keys.join(", "));
+        };
+        let mut new = match toml::from_str::<toml::Table>(&format!("x = {value}")) {
+            Ok(mut parsed) => parsed.remove("x").unwrap_or_else(|| toml::Value::String(value.into())),
+            Err(_) => toml::Value::String(value.into()),
+        };
+        // 1 is as good as 1.0 where a number with a point belongs.
+        if let (toml::Value::Float(_), toml::Value::Integer(i)) = (old, &new) {
+            new = toml::Value::Float(*i as f64);
+        }
+        table.insert(key.into(), new);
+        let changed: Self =
+            table.try_into().map_err(|error| anyhow::anyhow!("{key}={value} is not possible: {}", error.message()))?;
+        *self = changed;
+        Ok(())
+    }
+
+    /// Says what is wrong with the settings, if anything is.
+    pub fn validate(&self) -> Result<()> {
+        let positive = [
+            ("learning_rate", self.learning_rate),
+            ("adam_epsilon", self.adam_epsilon),
+            ("actor_grad_norm", self.actor_grad_norm),
+            ("critic_grad_norm", self.critic_grad_norm),
+            ("sigma", self.sigma),
+            ("clip", self.clip),
+            ("kl_stop", self.kl_stop),
+        ];
+        for (key, value) in positive {
+            if !(value.is_finite() && value > 0.0) {
+                bail!("{key} is {value}; it must be a number above 0");
+            }
+        }
+        let shares = [("gamma", self.gamma), ("lambda", self.lambda), ("learning_rate_end", self.learning_rate_end)];
+        for (key, value) in shares {
+            if !(0.0..=1.0).contains(&value) {
+                bail!("{key} is {value}; it must be from 0 to 1");
+            }
+        }
+        if !(self.entropy.is_finite() && self.entropy >= 0.0) {
+            bail!("entropy is {}; it must be 0 or more", self.entropy);
+        }
+        if !(self.checkpoint_seconds >= 0.0) {
+            bail!("checkpoint_seconds is {}; it must be 0 or more", self.checkpoint_seconds);
+        }
+        let limits = [
+            ("environments", self.environments, 1, 4096),
+            ("rollout_steps", self.rollout_steps, 1, 65_536),
+            ("minibatches", self.minibatches, 1, self.environments.saturating_mul(self.rollout_steps).max(1)),
+            ("epochs", self.epochs, 1, 1000),
+            ("critic_epochs", self.critic_epochs, 1, 1000),
+            ("threads", self.threads, 0, 1024),
+        ];
+        for (key, value, low, high) in limits {
+            if !(low..=high).contains(&value) {
+                bail!("{key} is {value}; it must be from {low} to {high}");
+            }
+        }
+        if self.total_steps == 0 {
+            bail!("total_steps is 0; it must be at least 1");
+        }
+        Ok(())
+    }
+
+    /// Environment steps in an iteration.
+    pub fn steps_per_iteration(&self) -> u64 {
+        (self.environments * self.rollout_steps) as u64
+    }
+
+    /// Iterations of the whole run.
+    pub fn iterations(&self) -> u64 {
+        self.total_steps.div_ceil(self.steps_per_iteration())
+    }
+
+    /// Learning rate of an iteration.
+    pub fn learning_rate_at(&self, iteration: u64) -> f32 {
+        let done = iteration as f64 / self.iterations().max(1) as f64;
+        (f64::from(self.learning_rate) * (1.0 - done * (1.0 - f64::from(self.learning_rate_end)))) as f32
+    }
+
+    /// The part that the update needs.
+    pub fn ppo(&self) -> PpoSettings {
+        PpoSettings {
+            minibatches: self.minibatches,
+            epochs: self.epochs,
+            critic_epochs: self.critic_epochs,
+            gamma: self.gamma,
+            lambda: self.lambda,
+            clip: self.clip,
+            kl_stop: self.kl_stop,
+            entropy: self.entropy,
+            actor_grad_norm: self.actor_grad_norm,
+            critic_grad_norm: self.critic_grad_norm,
+        }
+    }
+}
+
+/// What a run came to.
+#[derive(Clone, Debug)]
+pub struct TrainSummary {
+    /// The policy at the end.
+    pub network: Network,
+    /// Environment steps taken, those before a resumption included.
+    pub steps: u64,
+    /// Iterations done.
+    pub iterations: u64,
+    /// Whether the run was stopped before its end (and can be resumed).
+    pub interrupted: bool,
+    /// Wall time of this session.
+    pub wall: Duration,
+    /// What the last evaluation said.
+    pub evaluation: Vec<(String, f64)>,
+}
+
+/// Makes the environment of an index. The same index must always give the same environment.
+pub type MakeEnvironment<'a> = &'a dyn Fn(usize) -> Result<Box<dyn Environment>>;
+
+/// Judges a policy after so many steps; what it returns goes into the metrics under these names.
+pub type Evaluate<'a> = &'a mut dyn FnMut(&Network, u64) -> Vec<(String, f64)>;
+
+/// A run between two iterations.
+pub struct Trainer {
+    config: TrainConfig,
+    fingerprint: String,
+    learner: Learner,
+    observations: Running,
+    privileged: Running,
+    slots: Vec<Slot>,
+    lanes: Vec<Lane>,
+    iteration: u64,
+}
+
+/// What an iteration did.
+#[derive(Clone, Debug)]
+pub struct Report {
+    /// Where the time went.
+    pub times: Times,
+    /// The same seed always gives the same numbers here.
+    pub scalars: Vec<(String, f64)>,
+}
+
+impl Report {
+    /// The number of that name; NaN if there is none.
+    pub fn get(&self, name: &str) -> f64 {
+        self.scalars.iter().find(|(key, _)| key == name).map_or(f64::NAN, |(_, value)| *value)
+    }
+}
+
+impl Trainer {
+    /// A run that has not begun.
+    pub fn new(config: &TrainConfig, make: MakeEnvironment, fingerprint: &str) -> Result<Self> {
+        config.validate()?;
+        let mut slots = Vec::with_capacity(config.environments);
+        for index in 0..config.environments {
+            slots.push(Slot::new(checked(make(index)?, index)?, index, config.seed));
+        }
+        Ok(Self {
+            learner: Learner::new(config.method, config.seed, config.sigma, config.adam_epsilon),
+            observations: Running::new(SIZE),
+            privileged: Running::new(PRIVILEGED),
+            lanes: vec![Lane::default(); config.environments],
+            slots,
+            iteration: 0,
+            config: config.clone(),
+            fingerprint: fingerprint.into(),
+        })
+    }
+
+    /// A run as a checkpoint has it. The settings must be those of the checkpoint; only how long it runs, how often it evaluates and
+    /// saves, and the threads may differ.
+    pub fn resume(checkpoint: &Checkpoint, config: &TrainConfig, make: MakeEnvironment, fingerprint: &str) -> Result<Self> {
+        if checkpoint.fingerprint != fingerprint {
+            bail!(
+                "the checkpoint is of another robot or task: it was trained for `{}`, this is `{fingerprint}`",
+                checkpoint.fingerprint
+            );
+        }
+        let mut was = config_of(checkpoint)?;
+        was.total_steps = config.total_steps;
+        was.evaluate_every = config.evaluate_every;
+        was.checkpoint_seconds = config.checkpoint_seconds;
+        was.threads = config.threads;
+        if was != *config {
+            let (was, is) = (toml::Table::try_from(&was)?, toml::Table::try_from(config)?);
+            let changed = was.iter().filter(|(key, value)| is.get(*key) != Some(value));
+            let changed: Vec<_> = changed.map(|(key, value)| format!("{key} (it was {value})")).collect();
+            bail!("a resumed run keeps its settings, but these were changed: {}", changed.join(", "));
+        }
+        let mut trainer = Self::new(config, make, fingerprint)?;
+        trainer.iteration = checkpoint.iteration;
+        let learner = &mut trainer.learner;
+        let [actor, actor_first, actor_second, critic, critic_first, critic_second] = &checkpoint.parameters;
+        for (to, from) in [
+            (&mut learner.actor, actor),
+            (&mut learner.actor_adam.first, actor_first),
+            (&mut learner.actor_adam.second, actor_second),
+            (&mut learner.critic, critic),
+            (&mut learner.critic_adam.first, critic_first),
+            (&mut learner.critic_adam.second, critic_second),
+        ] {
+            if to.len() != from.len() {
+                bail!("the checkpoint has {} parameters where this version of the network has {}", from.len(), to.len());
+            }
+            to.clone_from(from);
+        }
+        [learner.actor_adam.steps, learner.critic_adam.steps] = checkpoint.adam_steps;
+        let mut numbers = checkpoint.statistics.iter().copied();
+        let statistics = (|| {
+            Some((
+                Running::from_numbers(SIZE, &mut numbers)?,
+                Running::from_numbers(PRIVILEGED, &mut numbers)?,
+                ValueNorm::from_numbers(&mut numbers)?,
+            ))
+        })();
+        let Some((observations, privileged, value_norm)) = statistics else {
+            bail!("the checkpoint has too few statistics: it is of another version");
+        };
+        (trainer.observations, trainer.privileged, trainer.learner.value_norm) = (observations, privileged, value_norm);
+        if checkpoint.episodes.len() != config.environments {
+            bail!("the checkpoint has {} environments, the settings say {}", checkpoint.episodes.len(), config.environments);
+        }
+        for (index, episode) in checkpoint.episodes.iter().enumerate() {
+            let environment = checked(make(index)?, index)?;
+            let slot = Slot::restore(environment, index, config.seed, episode.number, episode.actions.clone());
+            trainer.slots[index] = slot;
+        }
+        Ok(trainer)
+    }
+
+    /// All that [`Trainer::resume`] needs.
+    pub fn checkpoint(&self) -> Result<Checkpoint> {
+        let learner = &self.learner;
+        let vectors = [
+            &learner.actor,
+            &learner.actor_adam.first,
+            &learner.actor_adam.second,
+            &learner.critic,
+            &learner.critic_adam.first,
+            &learner.critic_adam.second,
+        ];
+        let numbers = self.observations.numbers().chain(self.privileged.numbers()).chain(learner.value_norm.numbers());
+        let episode = |slot: &Slot| Episode { number: slot.episode, actions: slot.actions.clone() };
+        Ok(Checkpoint {
+            config: toml::to_string(&self.config).context("the settings cannot be written as TOML")?,
+            fingerprint: self.fingerprint.clone(),
+            iteration: self.iteration,
+            adam_steps: [learner.actor_adam.steps, learner.critic_adam.steps],
+            parameters: vectors.map(Clone::clone),
+            statistics: numbers.collect(),
+            episodes: self.slots.iter().map(episode).collect(),
+        })
+    }
+
+    /// Collects and learns once.
+    pub fn iterate(&mut self) -> Result<Report> {
+        let began = Instant::now();
+        let threads = match self.config.threads {
+            0 => std::thread::available_parallelism().map_or(1, usize::from),
+            threads => threads,
+        };
+        let policy = Inference::new(&ActorLayout::new(self.config.method), &self.learner.actor);
+        let iteration = Iteration {
+            policy: &policy,
+            observations: Frozen::new(&self.observations),
+            privileged: Frozen::new(&self.privileged),
+            run_seed: self.config.seed,
+            iteration: self.iteration,
+            steps: self.config.rollout_steps,
+        };
+        let (observations, privileged) = (&mut self.observations, &mut self.privileged);
+        let split = collect(&mut self.slots, &mut self.lanes, iteration, threads, observations, privileged);
+        let rollout = began.elapsed();
+        let learning_rate = self.config.learning_rate_at(self.iteration);
+        let stats = update(
+            &mut self.learner,
+            self.config.method,
+            &mut self.lanes,
+            &self.config.ppo(),
+            learning_rate,
+            (self.config.seed, self.iteration),
+            threads,
+        );
+        if !self.learner.actor.iter().chain(&self.learner.critic).all(|p| p.is_finite()) {
+            bail!(
+                "training diverged in iteration {}: a weight is no longer a finite number. The last checkpoint is from before; \
+                 a lower learning_rate may help",
+                self.iteration + 1
+            );
+        }
+        self.iteration += 1;
+
+        let wall = began.elapsed();
+        // The threads' own times, scaled to the wall time of the rollout they fill together.
+        let busy = (split.physics + split.inference).as_secs_f64().max(1e-9);
+        let physics = rollout.mul_f64(split.physics.as_secs_f64() / busy);
+        let times = Times {
+            steps: self.config.steps_per_iteration(),
+            wall,
+            physics,
+            inference: rollout.saturating_sub(physics),
+            update: wall.saturating_sub(rollout),
+        };
+        let episodes: Vec<_> = self.lanes.iter().flat_map(|lane| &lane.episodes).collect();
+        let mean = |f: &dyn Fn(&crate::environment::Outcome) -> f64| {
+            episodes.iter().map(|outcome| f(outcome)).sum::<f64>() / episodes.len() as f64
+        };
+        let rewards: f64 = self.lanes.iter().flat_map(|lane| &lane.rewards).map(|r| f64::from(*r)).sum();
+        let sigma = &self.learner.actor[ActorLayout::new(self.config.method).log_sigma.range()];
+        let scalars = [
+            ("charts/episodic_return", mean(&|o| f64::from(o.episode_return))),
+            ("charts/episodic_length", mean(&|o| f64::from(o.steps))),
+            ("charts/success_rate", mean(&|o| f64::from(u8::from(o.success)))),
+            ("charts/final_distance", mean(&|o| f64::from(o.distance))),
+            ("charts/episodes", episodes.len() as f64),
+            ("charts/step_reward", rewards / self.config.steps_per_iteration() as f64),
+            ("charts/learning_rate", f64::from(learning_rate)),
+            ("charts/sigma", sigma.iter().map(|l| f64::from(l.exp())).sum::<f64>() / sigma.len() as f64),
+            ("losses/policy_loss", stats.policy_loss),
+            ("losses/value_loss", stats.value_loss),
+            ("losses/approx_kl", stats.approx_kl),
+            ("losses/first_minibatch_kl", stats.first_kl),
+            ("losses/clipfrac", stats.clip_fraction),
+            ("losses/entropy", stats.entropy),
+            ("losses/explained_variance", stats.explained_variance),
+            ("losses/actor_grad_norm", stats.actor_grad_norm),
+            ("losses/critic_grad_norm", stats.critic_grad_norm),
+            ("losses/actor_minibatches", stats.actor_minibatches as f64),
+        ];
+        Ok(Report { times, scalars: scalars.into_iter().map(|(name, value)| (name.into(), value)).collect() })
+    }
+
+    /// The policy as it is now.
+    pub fn network(&self) -> Network {
+        let layout = ActorLayout::new(self.config.method);
+        layout.network(&self.learner.actor, self.observations.mean(), self.observations.std())
+    }
+
+    /// Environment steps taken.
+    pub fn steps(&self) -> u64 {
+        self.iteration * self.config.steps_per_iteration()
+    }
+
+    /// Iterations done.
+    pub fn iteration(&self) -> u64 {
+        self.iteration
+    }
+
+    /// What is learnt so far.
+    pub fn learner(&self) -> &Learner {
+        &self.learner
+    }
+}
+
+fn checked(environment: Box<dyn Environment>, index: usize) -> Result<Box<dyn Environment>> {
+    let modules = environment.modules();
+    if !(1..=composer_shared::robot::MAX_MODULES).contains(&modules) {
+        bail!("environment {index} has {modules} modules; there must be 1 to {}", composer_shared::robot::MAX_MODULES);
+    }
+    Ok(environment)
+}
+
+/// The settings a checkpoint was made with.
+pub fn config_of(checkpoint: &Checkpoint) -> Result<TrainConfig> {
+    toml::from_str(&checkpoint.config).context("the settings in the checkpoint are of another version of this program")
+}
+
+/// Trains a policy; the checkpoint, `metrics.jsonl` and the TensorBoard files go to the folder `out`.
+///
+/// `fingerprint` says in the caller's words what is trained for (robot, task, difficulty); a checkpoint of another is refused. With
+/// `resume` the run in `out` goes on as if it had never stopped. Ctrl-C or SIGTERM ends the run with a checkpoint after the running
+/// iteration; a second one ends it at once.
+pub fn train(
+    config: &TrainConfig,
+    make: MakeEnvironment,
+    fingerprint: &str,
+    out: &Path,
+    resume: bool,
+    on_evaluate: Evaluate,
+) -> Result<TrainSummary> {
+    let began = Instant::now();
+    config.validate()?;
+    std::fs::create_dir_all(out).with_context(|| format!("the folder {} cannot be made", out.display()))?;
+    let mut trainer = if resume {
+        let checkpoint = Checkpoint::read(out)?;
+        Trainer::resume(&checkpoint, config, make, fingerprint)
+            .with_context(|| format!("the run in {} cannot be resumed", out.display()))?
+    } else {
+        if out.join(checkpoint::FILE).exists() {
+            bail!("{} already holds a run: resume it with --resume, or choose another folder", out.display());
+        }
+        Trainer::new(config, make, fingerprint)?
+    };
+    // Before anything is computed: a folder that cannot be written to must not cost an hour.
+    trainer.checkpoint()?.write(out)?;
+    let cannot_log = || format!("the metrics cannot be written to {}; the last checkpoint is whole", out.display());
+    let mut metrics = Metrics::open(out, trainer.iteration(), trainer.steps()).with_context(cannot_log)?;
+
+    let stop = Signals::new()?;
+    let mut progress = Progress::new(config.iterations() * config.steps_per_iteration(), trainer.steps());
+    let mut saved = Instant::now();
+    let mut evaluation = Vec::new();
+    let mut interrupted = false;
+    while trainer.iteration() < config.iterations() {
+        let before = trainer.steps();
+        let report = trainer.iterate()?;
+        let steps = trainer.steps();
+        let last = trainer.iteration() == config.iterations();
+
+        let [physics, inference, update] = report.times.shares();
+        let mut scalars = report.scalars.clone();
+        scalars.extend([
+            ("charts/SPS".into(), report.times.steps_per_second()),
+            ("time/physics_share".into(), physics),
+            ("time/inference_share".into(), inference),
+            ("time/update_share".into(), update),
+            ("time/wall_seconds".into(), began.elapsed().as_secs_f64()),
+        ]);
+        let due = config.evaluate_every > 0 && (last || steps / config.evaluate_every > before / config.evaluate_every);
+        if due {
+            evaluation = on_evaluate(&trainer.network(), steps);
+            scalars.extend(evaluation.iter().cloned());
+        }
+        metrics.write(trainer.iteration(), steps, &scalars).with_context(cannot_log)?;
+        let shown = [
+            ("success", report.get("charts/success_rate")),
+            ("return", report.get("charts/episodic_return")),
+            ("kl", report.get("losses/approx_kl")),
+        ];
+        progress.update(steps, &report.times, &shown);
+
+        interrupted = stop.raised() && !last;
+        if last || interrupted || saved.elapsed().as_secs_f64() >= config.checkpoint_seconds {
+            trainer.checkpoint()?.write(out)?;
+            saved = Instant::now();
+        }
+        if interrupted {
+            progress.say(&format!("stopped after {steps} steps; {} is saved, --resume goes on", out.display()));
+            break;
+        }
+    }
+    progress.finish();
+    Ok(TrainSummary {
+        network: trainer.network(),
+        steps: trainer.steps(),
+        iterations: trainer.iteration(),
+        interrupted,
+        wall: began.elapsed(),
+        evaluation,
+    })
+}
+
+/// Notices Ctrl-C and SIGTERM while it lives.
+struct Signals {
+    flag: Arc<AtomicBool>,
+    registered: Vec<signal_hook::SigId>,
+}
+
+impl Signals {
+    fn new() -> Result<Self> {
+        use signal_hook::consts::{SIGINT, SIGTERM};
+        let flag = Arc::new(AtomicBool::new(false));
+        let mut registered = Vec::new();
+        for signal in [SIGINT, SIGTERM] {
+            // In this order: the first signal raises the flag, the next one finds it raised and ends the process.
+            registered.push(
+                signal_hook::flag::register_conditional_shutdown(signal, 130, Arc::clone(&flag))
+                    .context("no handler for Ctrl-C can be set up")?,
+            );
+            registered.push(
+                signal_hook::flag::register(signal, Arc::clone(&flag)).context("no handler for Ctrl-C can be set up")?,
+            );
+        }
+        Ok(Self { flag, registered })
+    }
+
+    fn raised(&self) -> bool {
+        self.flag.load(Ordering::Relaxed)
+    }
+}
+
+impl Drop for Signals {
+    fn drop(&mut self) {
+        for id in self.registered.drain(..) {
+            signal_hook::low_level::unregister(id);
+        }
+    }
+}

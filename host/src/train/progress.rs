@@ -1,0 +1,115 @@
+//! The progress bar, or a plain line now and then where there is no terminal.
+
+use std::io::IsTerminal;
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+/// How often a plain line is printed.
+const EVERY: Duration = Duration::from_secs(10);
+
+/// Where the time of some iterations went, wall time on all cores but for the two parts of the rollout.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Times {
+    /// Environment steps.
+    pub steps: u64,
+    /// Wall time.
+    pub wall: Duration,
+    /// Wall time of the rollouts, the part spent in the environments.
+    pub physics: Duration,
+    /// Wall time of the rollouts, the part spent in the policy and in book-keeping.
+    pub inference: Duration,
+    /// Wall time of the updates.
+    pub update: Duration,
+}
+
+impl Times {
+    /// Adds another span of time.
+    pub fn add(&mut self, other: &Times) {
+        self.steps += other.steps;
+        self.wall += other.wall;
+        self.physics += other.physics;
+        self.inference += other.inference;
+        self.update += other.update;
+    }
+
+    /// Environment steps per second.
+    pub fn steps_per_second(&self) -> f64 {
+        self.steps as f64 / self.wall.as_secs_f64().max(1e-9)
+    }
+
+    /// Shares of physics, inference and update, 0 to 1.
+    pub fn shares(&self) -> [f64; 3] {
+        let total = (self.physics + self.inference + self.update).as_secs_f64().max(1e-9);
+        [self.physics, self.inference, self.update].map(|part| part.as_secs_f64() / total)
+    }
+}
+
+/// Shows how a run is getting on, on standard error.
+#[derive(Debug)]
+pub struct Progress {
+    bar: Option<ProgressBar>,
+    total: u64,
+    last: Instant,
+    since: Times,
+}
+
+impl Progress {
+    /// For a run of `total` steps, of which `done` are done.
+    pub fn new(total: u64, done: u64) -> Self {
+        let bar = std::io::stderr().is_terminal().then(|| {
+            let bar = ProgressBar::new(total).with_position(done).with_elapsed(Duration::ZERO);
+            if let Ok(style) = ProgressStyle::with_template("{bar:30} {human_pos}/{human_len} steps, {eta} left | {msg}") {
+                bar.set_style(style);
+            }
+            bar.reset_eta();
+            bar
+        });
+        Self { bar, total, last: Instant::now(), since: Times::default() }
+    }
+
+    /// After an iteration: `done` steps in all, its times, and the numbers worth watching.
+    pub fn update(&mut self, done: u64, times: &Times, numbers: &[(&str, f64)]) {
+        self.since.add(times);
+        let due = self.last.elapsed() >= EVERY;
+        if self.bar.is_none() && !due {
+            return;
+        }
+        let [physics, inference, update] = self.since.shares().map(|share| (100.0 * share).round());
+        let mut message = format!(
+            "{:.0} steps/s (physics {physics:.0} %, inference {inference:.0} %, update {update:.0} %)",
+            self.since.steps_per_second()
+        );
+        for (name, value) in numbers {
+            if value.is_finite() {
+                message += &format!(", {name} {value:.3}");
+            }
+        }
+        match &self.bar {
+            Some(bar) => {
+                bar.set_position(done);
+                bar.set_message(message);
+            }
+            None => eprintln!("{done} of {} steps, {message}", self.total),
+        }
+        if due {
+            self.last = Instant::now();
+            self.since = Times::default();
+        }
+    }
+
+    /// Prints a line above the bar.
+    pub fn say(&self, line: &str) {
+        match &self.bar {
+            Some(bar) => bar.println(line),
+            None => eprintln!("{line}"),
+        }
+    }
+
+    /// Leaves the bar as it is.
+    pub fn finish(&self) {
+        if let Some(bar) = &self.bar {
+            bar.abandon();
+        }
+    }
+}

@@ -1,0 +1,797 @@
+//! Software in the loop: complete module controllers on the simulated bus, controlling a [`Plant`].
+//!
+//! One discrete-event loop in virtual time (ns) joins the plant, which advances in its own steps, one firmware controller a module,
+//! the ground station and the [`Bus`] between them. At time 0 the first SYNC is sent: the controllers were switched on so much earlier that the
+//! head takes the time over just then. So control cycle c covers the same time as control step c of an environment without a bus.
+//!
+//! - Sensors are sampled from the plant's state after its last whole step.
+//! - A torque that a controller has computed at time t acts from the first plant step that begins at t or later, never before.
+//! - Computing takes time: [`SilConfig::encode_latency_us`] from the last STATE needed until LATENT is ready to be sent,
+//!   [`SilConfig::act_latency_us`] from the last LATENT needed until the torque is at the motor.
+//! - An unplugged module is gone: no controller, no torque from the next plant step on. Plugged in again, a fresh controller starts.
+//! - With a dead actuator the plant gets no torque, whatever the controller says; with a zeroed sensor the controller reads
+//!   [`Sensors::ZERO`], with a stuck one always the same sample.
+//!
+//! The line is the station, then the modules from the head to the tail (the station elsewhere with [`SilConfig::station_behind`]), then, only
+//! if there are frames to inject, a foreign node. Everything follows from the plant, the policy image and the configuration: the same
+//! ones give the same run, bit for bit.
+
+use std::collections::VecDeque;
+use std::io::{self, Write};
+
+use composer_firmware::controller::{
+    BusKind, BusOffPolicy, BusStatus, Config, ConfigError, Controller, FaultSet, Micros, Stats, Timing,
+};
+use composer_shared::observation::Sensors;
+use composer_shared::policy::{Policy, PolicyError};
+use composer_shared::robot::{AXES, MAX_MODULES};
+use composer_shared::wire::{Frame, Function, Mode, StopCommand};
+
+use crate::bus::{self, Bus, BusConfig, Disturbance, ErrorState, Event};
+use crate::candump;
+use crate::faults::{Fault, ScheduledFault};
+use crate::frame_bits::BitRates;
+use crate::plant::Plant;
+use crate::station::Station;
+
+const NEVER: u64 = u64::MAX;
+
+/// A module's clock against true time.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Clock {
+    /// What it shows more than the others, us.
+    pub offset_us: u64,
+    /// How much faster it runs, parts per billion (1 ppm is 1000). Held within +-10 %.
+    pub drift_ppb: i32,
+}
+
+impl Clock {
+    fn drift(self) -> i128 {
+        i128::from(self.drift_ppb.clamp(-100_000_000, 100_000_000))
+    }
+
+    /// What it shows at true time `ns`, us.
+    fn show(self, ns: u64) -> Micros {
+        let passed = i128::from(ns) + i128::from(ns) * self.drift() / 1_000_000_000;
+        self.offset_us + (passed / 1000) as u64
+    }
+
+    /// The first true time, ns, at which it shows `us` or more.
+    fn reaches(self, us: Micros) -> u64 {
+        let passed = i128::from(us.saturating_sub(self.offset_us)) * 1000;
+        if self.drift_ppb == 0 {
+            return passed.min(i128::from(NEVER)) as u64;
+        }
+        let rate = 1_000_000_000 + self.drift();
+        let mut ns = (passed * 1_000_000_000 / rate).min(i128::from(NEVER)) as u64;
+        while ns < NEVER && self.show(ns) < us {
+            ns += 1;
+        }
+        ns
+    }
+}
+
+/// A frame that a foreign device sends.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Injected {
+    /// When, ns.
+    pub at_ns: u64,
+    /// What.
+    pub frame: Frame,
+}
+
+/// How a run is set up.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SilConfig {
+    /// Kind of bus.
+    pub bus: BusKind,
+    /// Its bit rates.
+    pub rates: BitRates,
+    /// What goes wrong and when ([`crate::faults::FaultPlan::draw`]).
+    pub faults: Vec<ScheduledFault>,
+    /// Seed of everything random on the bus: losses, delays, corruption.
+    pub seed: u64,
+    /// From the last STATE needed (or the state deadline) until LATENT is ready to be sent, us. The default, 200, is well above what
+    /// a Cortex-M4 at 170 MHz needs for the observation and the encoder.
+    pub encode_latency_us: u32,
+    /// From the last LATENT needed (or the collection deadline) until the torque is at the motor, us. Default 300.
+    pub act_latency_us: u32,
+    /// From hearing SYNC until GOAL is ready to be sent, us. Default 50.
+    pub station_latency_us: u32,
+    /// Clocks of the modules, head first; those not listed are exact.
+    pub clocks: Vec<Clock>,
+    /// Configured numbers of the modules, head first; those not listed have the right one.
+    pub numbers: Vec<u8>,
+    /// Number of modules between the head end of the cable and the station: 0 puts it at the head end.
+    pub station_behind: usize,
+    /// Stops and releases that the station sends, with their times in ns.
+    pub commands: Vec<(u64, StopCommand)>,
+    /// Frames of a foreign device at the tail end of the cable, in order of time.
+    pub injected: Vec<Injected>,
+    /// What controllers do after bus-off.
+    pub bus_off: BusOffPolicy,
+    /// Timing of the control cycle; none takes the default for policy, bus and number of modules.
+    pub timing: Option<Timing>,
+    /// The run ends here even if the plant is not done, ns. Default 10 minutes.
+    pub limit_ns: u64,
+}
+
+impl SilConfig {
+    /// A healthy robot on a bus of this kind: 1 Mbit/s, with 5 Mbit/s in the data phase of FD.
+    pub fn new(bus: BusKind) -> Self {
+        SilConfig {
+            bus,
+            rates: if bus == BusKind::Fd { BitRates::FD_1M_5M } else { BitRates::CLASSIC_1M },
+            faults: Vec::new(),
+            seed: 0,
+            encode_latency_us: 200,
+            act_latency_us: 300,
+            station_latency_us: 50,
+            clocks: Vec::new(),
+            numbers: Vec::new(),
+            station_behind: 0,
+            commands: Vec::new(),
+            injected: Vec::new(),
+            bus_off: BusOffPolicy::Recover,
+            timing: None,
+            limit_ns: 600_000_000_000,
+        }
+    }
+
+    fn clock(&self, module: usize) -> Clock {
+        self.clocks.get(module).copied().unwrap_or_default()
+    }
+}
+
+/// Why a run cannot be made.
+#[derive(Debug, thiserror::Error)]
+pub enum SilError {
+    /// The policy image is refused.
+    #[error("{0}")]
+    Policy(PolicyError),
+    /// A controller refuses its configuration.
+    #[error("{0}")]
+    Config(ConfigError),
+    /// The plant has no modules, or more than fit on a bus.
+    #[error("{0} modules cannot be simulated: a robot has 1 to {MAX_MODULES}")]
+    Modules(usize),
+    /// The bit rates make no sense.
+    #[error(
+        "bit rates of {nominal} and {data} bit/s cannot be: the nominal rate is 10000 to 1000000, the data rate at least as much and at most 8000000"
+    )]
+    Rates {
+        /// Nominal bit rate, bit/s.
+        nominal: u32,
+        /// Data bit rate, bit/s.
+        data: u32,
+    },
+    /// The plant's step is zero.
+    #[error("the plant's step is 0 ns, but must be at least 1")]
+    Step,
+    /// The capture cannot be written.
+    #[error("the capture cannot be written: {0}")]
+    Capture(#[from] io::Error),
+}
+
+/// One module at the end of a control cycle.
+#[derive(Clone, Copy, Debug)]
+pub struct ModuleView<'a> {
+    /// Whether it is plugged in. If not, all else is empty.
+    pub plugged: bool,
+    /// What it is at.
+    pub mode: Mode,
+    /// Number of its control cycle.
+    pub cycle: u16,
+    /// Whose SYNC it follows.
+    pub time_keeper: Option<u8>,
+    /// Modules that it believes alive, itself included, as a bit mask.
+    pub alive: u64,
+    /// Modules that it attended over in its last action, itself included, as a bit mask.
+    pub heard: u64,
+    /// Attention weights of its last action by module, Q15 (32767 is 1).
+    pub attention: &'a [u16; MAX_MODULES],
+    /// The torque that the plant applies (yaw, pitch).
+    pub torque: [f32; AXES],
+    /// Its active faults.
+    pub faults: FaultSet,
+    /// Its error state on the bus.
+    pub bus: ErrorState,
+}
+
+/// The robot at the end of a control cycle.
+#[derive(Clone, Debug)]
+pub struct CycleView<'a> {
+    /// Number of the cycle, from 0, by true time.
+    pub cycle: u32,
+    /// Its end, ns.
+    pub at_ns: u64,
+    /// The modules, head first.
+    pub modules: &'a [ModuleView<'a>],
+    /// Modules behind which the cable is cut, as a bit mask.
+    pub cuts: u64,
+}
+
+/// What became of one module.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ModuleReport {
+    /// Its controller's counters, added up if it was plugged in again.
+    pub stats: Stats,
+    /// Its counters on the bus.
+    pub bus: bus::NodeStats,
+    /// Its error counters at the end.
+    pub errors: bus::ErrorCounters,
+    /// Longest time between two actions while plugged in, ms. From its start to its first action counts too, and from its
+    /// last to the end.
+    pub longest_gap_ms: f64,
+}
+
+/// What a run was like.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SilReport {
+    /// Length, ns of virtual time.
+    pub duration_ns: u64,
+    /// Control cycles that the module with the most of them started.
+    pub cycles: u32,
+    /// Share of the time in which the bus was busy, 0 to 1.
+    pub bus_load: f64,
+    /// Largest age of a latent when it was acted on, from the start of its cycle to the torque at the motor, ms.
+    pub latent_age_max_ms: f64,
+    /// Cycles in which a live neighbour's latent was missing when a module acted, over all modules.
+    pub deadline_misses: u64,
+    /// Frames sent successfully.
+    pub frames: u64,
+    /// Error frames.
+    pub error_frames: u64,
+    /// Frames lost at receivers.
+    pub dropped: u64,
+    /// Longest time from a frame being ready to its reception, ms.
+    pub frame_latency_max_ms: f64,
+    /// The faults that occurred.
+    pub faults: Vec<ScheduledFault>,
+    /// Whether the run ended by [`SilConfig::limit_ns`] instead of the plant being done.
+    pub cut_short: bool,
+    /// The modules, head first.
+    pub modules: Vec<ModuleReport>,
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+enum SensorState {
+    #[default]
+    Good,
+    Zeroed,
+    Stuck(Sensors),
+}
+
+struct Module<'a> {
+    controller: Option<Controller<'a>>,
+    clock: Clock,
+    next_poll_ns: u64,
+    /// What the controller answered last.
+    commanded: [f32; AXES],
+    /// Torques on their way to the motor, with their times.
+    coming: VecDeque<(u64, [f32; AXES])>,
+    /// What the controller's motors do now.
+    motor: [f32; AXES],
+    /// What the plant was told.
+    applied: Option<[f32; AXES]>,
+    sensors: SensorState,
+    actuator_dead: bool,
+    babble: Option<u16>,
+    misread: f64,
+    /// What the plant's sensors read in this plant step.
+    sample: Option<Sensors>,
+    acted: u32,
+    acted_ns: u64,
+    longest_gap_ns: u64,
+    /// Counters of controllers that are gone.
+    past: Stats,
+}
+
+fn add(past: &Stats, now: &Stats) -> Stats {
+    let sum = u32::saturating_add;
+    Stats {
+        cycles: sum(past.cycles, now.cycles),
+        acted: sum(past.acted, now.acted),
+        deadline_misses: sum(past.deadline_misses, now.deadline_misses),
+        latent_age_us: now.latent_age_us,
+        latent_age_max_us: past.latent_age_max_us.max(now.latent_age_max_us),
+        malformed: sum(past.malformed, now.malformed),
+        foreign: sum(past.foreign, now.foreign),
+        stale: sum(past.stale, now.stale),
+        takeovers: sum(past.takeovers, now.takeovers),
+        without_sync: sum(past.without_sync, now.without_sync),
+    }
+}
+
+struct Engine<'a, 'c> {
+    config: &'c SilConfig,
+    policy: Policy<'a>,
+    bus: Bus,
+    station: Station,
+    station_node: usize,
+    modules: Vec<Module<'a>>,
+    /// What starts (`true`) and ends, in order of time; `next_change` is the first that has not.
+    changes: Vec<(u64, bool, Fault)>,
+    next_change: usize,
+    active: Vec<Fault>,
+    next_command: usize,
+    next_injected: usize,
+    /// The earliest of the modules' next polls.
+    next_poll_ns: u64,
+}
+
+/// Runs an episode: from now until the plant is done.
+///
+/// `image` is the policy image of all modules. `capture` gets a candump log: interface `can0` is the piece of cable at the head end, `can1` the
+/// next one after a cut, and so on. `observer` is called at the end of each control cycle, and at the end of the run.
+pub fn run<P: Plant + ?Sized>(
+    plant: &mut P,
+    image: &[u8],
+    config: &SilConfig,
+    mut capture: Option<&mut dyn Write>,
+    observer: &mut dyn FnMut(&CycleView<'_>, &P),
+) -> Result<SilReport, SilError> {
+    let policy = Policy::parse(image).map_err(SilError::Policy)?;
+    let count = plant.modules();
+    if count == 0 || count > MAX_MODULES {
+        return Err(SilError::Modules(count));
+    }
+    let BitRates { nominal, data } = config.rates;
+    if !(10_000..=1_000_000).contains(&nominal) || !(nominal..=8_000_000).contains(&data) {
+        return Err(SilError::Rates { nominal, data });
+    }
+    let step_ns = plant.step_ns();
+    if step_ns == 0 {
+        return Err(SilError::Step);
+    }
+    let mut engine = Engine::new(config, policy, count)?;
+    let period_ns = u64::from(engine.timing().period_us) * 1000;
+    let (mut next_step, mut next_view, mut cycle) = (step_ns, period_ns, 0);
+    let mut now = 0;
+    while !plant.done() && now < config.limit_ns {
+        let next = engine.next_ns().min(next_step);
+        now = next.min(config.limit_ns);
+        engine.change_faults(plant, now);
+        if next_step <= now {
+            plant.step();
+            engine.apply_torques(plant, now);
+            next_step += step_ns;
+            if now >= next_view || plant.done() {
+                engine.view(cycle, now, plant, observer);
+                cycle += 1;
+                next_view += period_ns;
+                if plant.done() {
+                    break;
+                }
+            }
+        }
+        engine.send_scripted(now);
+        while let Some(event) = engine.bus.poll(now) {
+            engine.handle(plant, &event, &mut capture)?;
+        }
+        engine.poll_due(plant, now);
+    }
+    Ok(engine.report(now, !plant.done()))
+}
+
+impl<'a, 'c> Engine<'a, 'c> {
+    fn new(config: &'c SilConfig, policy: Policy<'a>, count: usize) -> Result<Self, SilError> {
+        let nodes = count + 1 + usize::from(!config.injected.is_empty());
+        let bus_config = BusConfig { rates: config.rates, automatic_recovery: config.bus_off == BusOffPolicy::Recover };
+        let mut changes = Vec::new();
+        for scheduled in &config.faults {
+            changes.push((scheduled.at_ns, true, scheduled.fault));
+            changes.extend(scheduled.until_ns.map(|until| (until, false, scheduled.fault)));
+        }
+        changes.sort_by_key(|change| change.0);
+        let mut engine = Engine {
+            config,
+            policy,
+            bus: Bus::new(bus_config, nodes, config.seed),
+            station: Station::new(config.bus == BusKind::Fd),
+            station_node: config.station_behind.min(count),
+            modules: Vec::with_capacity(count),
+            changes,
+            next_change: 0,
+            active: Vec::new(),
+            next_command: 0,
+            next_injected: 0,
+            next_poll_ns: 0,
+        };
+        for module in 0..count {
+            engine.modules.push(Module {
+                controller: None,
+                clock: config.clock(module),
+                next_poll_ns: 0,
+                commanded: [0.0; AXES],
+                coming: VecDeque::new(),
+                motor: [0.0; AXES],
+                applied: None,
+                sensors: SensorState::Good,
+                actuator_dead: false,
+                babble: None,
+                misread: 0.0,
+                sample: None,
+                acted: 0,
+                acted_ns: 0,
+                longest_gap_ns: 0,
+                past: Stats::default(),
+            });
+        }
+        // Switched on so long ago that the head, which hears nobody, takes the time over at 0.
+        let timing = engine.timing();
+        let wait =
+            u64::from(timing.takeover_periods) * u64::from(timing.period_us) + u64::from(timing.takeover_stagger_us);
+        for (module, state) in engine.modules.iter_mut().enumerate() {
+            let started = state.clock.offset_us;
+            state.clock.offset_us += wait;
+            state.controller = Some(start(config, policy, module, count, started)?);
+        }
+        Ok(engine)
+    }
+
+    fn timing(&self) -> Timing {
+        let count = self.modules.len().max(1) as u8;
+        self.config.timing.unwrap_or_else(|| Timing::for_policy(&self.policy, self.config.bus, count))
+    }
+
+    /// The node of a module, by its place in the line.
+    fn node(&self, module: usize) -> usize {
+        module + usize::from(module >= self.station_node)
+    }
+
+    /// The module at a node, if it is one.
+    fn module(&self, node: usize) -> Option<usize> {
+        if node == self.station_node {
+            return None;
+        }
+        Some(node - usize::from(node > self.station_node)).filter(|module| *module < self.modules.len())
+    }
+
+    /// When something happens next, the plant apart.
+    fn next_ns(&self) -> u64 {
+        let change = self.changes.get(self.next_change).map_or(NEVER, |change| change.0);
+        let command = self.config.commands.get(self.next_command).map_or(NEVER, |command| command.0);
+        let injected =
+            self.config.injected.get(self.next_injected).filter(|_| self.bus.has_room(self.modules.len() + 1));
+        let injected = injected.map_or(NEVER, |injected| injected.at_ns);
+        change.min(command).min(injected).min(self.next_poll_ns).min(self.bus.next_event_ns())
+    }
+
+    /// Starts and ends faults.
+    fn change_faults<P: Plant + ?Sized>(&mut self, plant: &P, now: u64) {
+        let mut changed = false;
+        while let Some(&(at, starts, fault)) = self.changes.get(self.next_change)
+            && at <= now
+        {
+            self.next_change += 1;
+            changed = true;
+            if starts {
+                self.active.push(fault);
+            } else if let Some(index) = self.active.iter().position(|active| *active == fault) {
+                self.active.remove(index);
+            }
+        }
+        if !changed {
+            return;
+        }
+        let either = |p: f64, q: f64| 1.0 - (1.0 - p) * (1.0 - q);
+        let mut disturbance = Disturbance::default();
+        let mut cuts = 0u64;
+        for fault in &self.active {
+            match *fault {
+                Fault::Drop(p) => disturbance.drop = either(disturbance.drop, p),
+                Fault::Delay(ns) => disturbance.delay_ns = disturbance.delay_ns.max(ns),
+                Fault::Corrupt(p) => disturbance.corrupt = either(disturbance.corrupt, p),
+                Fault::Duplicate(p) => disturbance.duplicate = either(disturbance.duplicate, p),
+                Fault::Cut(module) => cuts |= 1u64.checked_shl(module as u32).unwrap_or(0),
+                _ => {}
+            }
+        }
+        self.bus.set_disturbance(disturbance);
+        for module in 0..self.modules.len().saturating_sub(1) {
+            let node = self.node(module);
+            self.bus.set_cut(now, node, cuts >> module & 1 == 1);
+        }
+        for module in 0..self.modules.len() {
+            self.set_module_faults(plant, module, now);
+        }
+    }
+
+    fn set_module_faults<P: Plant + ?Sized>(&mut self, plant: &P, module: usize, now: u64) {
+        let node = self.node(module);
+        let mine = |fault: &&Fault| fault.module() == Some(module);
+        let has = |wanted: Fault| self.active.contains(&wanted);
+        let unplugged = has(Fault::Unplug(module));
+        let dead = has(Fault::ActuatorDead(module));
+        let zeroed = has(Fault::SensorZeroed(module));
+        let stuck = has(Fault::SensorStuck(module));
+        let babble = self.active.iter().filter(mine).find_map(|fault| match fault {
+            Fault::Babble(_, id) => Some(*id),
+            _ => None,
+        });
+        let misread = self.active.iter().filter(mine).fold(0.0f64, |p, fault| match fault {
+            Fault::Misread(_, q) => p.max(*q),
+            _ => p,
+        });
+        let babble = babble.filter(|_| !unplugged);
+        let state = &mut self.modules[module];
+        state.actuator_dead = dead;
+        state.sensors = match state.sensors {
+            _ if zeroed => SensorState::Zeroed,
+            SensorState::Stuck(sample) if stuck => SensorState::Stuck(sample),
+            _ if stuck => SensorState::Stuck(plant.sensors(module)),
+            _ => SensorState::Good,
+        };
+        if state.misread != misread {
+            state.misread = misread;
+            self.bus.set_misread(node, misread);
+        }
+        if unplugged && state.controller.is_some() {
+            self.unplug(module, now);
+        } else if !unplugged && state.controller.is_none() {
+            self.plug(module, now);
+        }
+        let state = &mut self.modules[module];
+        if state.babble != babble {
+            state.babble = babble;
+            let frame = babble.and_then(|id| Frame::new(id, self.config.bus == BusKind::Fd, &[0x55; 8]));
+            self.bus.set_babble(now, node, frame);
+        }
+    }
+
+    fn unplug(&mut self, module: usize, now: u64) {
+        let node = self.node(module);
+        self.bus.unplug(now, node);
+        let state = &mut self.modules[module];
+        if let Some(controller) = state.controller.take() {
+            state.past = add(&state.past, controller.stats());
+        }
+        state.longest_gap_ns = state.longest_gap_ns.max(now.saturating_sub(state.acted_ns));
+        state.next_poll_ns = NEVER;
+        state.commanded = [0.0; AXES];
+        state.coming.clear();
+        state.coming.push_back((now, [0.0; AXES]));
+        state.babble = None;
+    }
+
+    fn plug(&mut self, module: usize, now: u64) {
+        let node = self.node(module);
+        let count = self.modules.len();
+        let state = &mut self.modules[module];
+        let local = state.clock.show(now);
+        // The same configuration was accepted before.
+        state.controller = start(self.config, self.policy, module, count, local).ok();
+        state.next_poll_ns = now;
+        state.acted = 0;
+        state.acted_ns = now;
+        self.next_poll_ns = self.next_poll_ns.min(now);
+        self.bus.plug(now, node);
+    }
+
+    /// A plant step has ended at `now`; the next begins with these torques.
+    fn apply_torques<P: Plant + ?Sized>(&mut self, plant: &mut P, now: u64) {
+        for (module, state) in self.modules.iter_mut().enumerate() {
+            state.sample = None;
+            while let Some(&(at, torque)) = state.coming.front()
+                && at <= now
+            {
+                state.motor = torque;
+                state.coming.pop_front();
+            }
+            let torque = if state.actuator_dead { [0.0; AXES] } else { state.motor };
+            if state.applied != Some(torque) {
+                state.applied = Some(torque);
+                plant.set_torque(module, torque);
+            }
+        }
+    }
+
+    /// Sends what the station and the foreign device have planned.
+    fn send_scripted(&mut self, now: u64) {
+        while let Some(&(at, command)) = self.config.commands.get(self.next_command)
+            && at <= now
+        {
+            self.next_command += 1;
+            let _ = self.bus.send(self.station_node, &self.station.command(command), now);
+        }
+        let foreign = self.modules.len() + 1;
+        while let Some(injected) = self.config.injected.get(self.next_injected)
+            && injected.at_ns <= now
+            && self.bus.has_room(foreign)
+        {
+            self.next_injected += 1;
+            let _ = self.bus.send(foreign, &injected.frame, now);
+        }
+    }
+
+    fn handle<P: Plant + ?Sized>(
+        &mut self,
+        plant: &P,
+        event: &Event,
+        capture: &mut Option<&mut dyn Write>,
+    ) -> Result<(), SilError> {
+        match event {
+            Event::Delivered { at_ns, frame, receivers, segment, late, transmitters } => {
+                if let Some(out) = capture
+                    && !late
+                {
+                    let interface = format!("can{}", self.bus.cuts_before(*segment));
+                    candump::write_entry(*out, *at_ns, &interface, frame)?;
+                }
+                for node in bus::nodes(*receivers) {
+                    if node == self.station_node {
+                        self.tell_station(plant, frame, *at_ns);
+                    } else if let Some(module) = self.module(node) {
+                        self.poll(plant, module, *at_ns, Some(frame));
+                    }
+                }
+                if !late {
+                    // A mailbox is free again.
+                    for module in bus::nodes(*transmitters).filter_map(|node| self.module(node)) {
+                        self.pump(module, *at_ns);
+                    }
+                }
+            }
+            Event::State { at_ns, node, .. } => {
+                if let Some(module) = self.module(*node) {
+                    self.poll(plant, module, *at_ns, None);
+                }
+            }
+            Event::ErrorFrame { .. } => {}
+        }
+        Ok(())
+    }
+
+    fn tell_station<P: Plant + ?Sized>(&mut self, plant: &P, frame: &Frame, now: u64) {
+        if frame.function() != Some(Function::Sync) {
+            return;
+        }
+        if let Some(answer) = self.station.receive(frame, plant.goal()) {
+            self.bus.cancel(self.station_node, |waiting| waiting.id == answer.id);
+            let ready = now + u64::from(self.config.station_latency_us) * 1000;
+            let _ = self.bus.send(self.station_node, &answer, ready);
+        }
+    }
+
+    fn poll_due<P: Plant + ?Sized>(&mut self, plant: &P, now: u64) {
+        if self.next_poll_ns > now {
+            return;
+        }
+        for module in 0..self.modules.len() {
+            if self.modules[module].next_poll_ns <= now {
+                self.poll(plant, module, now, None);
+            }
+        }
+        self.next_poll_ns = self.modules.iter().map(|state| state.next_poll_ns).min().unwrap_or(NEVER);
+    }
+
+    fn poll<P: Plant + ?Sized>(&mut self, plant: &P, module: usize, now: u64, frame: Option<&Frame>) {
+        let node = self.node(module);
+        let status = match self.bus.state(node) {
+            ErrorState::Active => BusStatus::ErrorActive,
+            ErrorState::Passive => BusStatus::ErrorPassive,
+            ErrorState::BusOff => BusStatus::BusOff,
+        };
+        let state = &mut self.modules[module];
+        let Some(controller) = &mut state.controller else { return };
+        let sensors = match &state.sensors {
+            SensorState::Good => &*state.sample.get_or_insert_with(|| plant.sensors(module)),
+            SensorState::Zeroed => &Sensors::ZERO,
+            SensorState::Stuck(sample) => sample,
+        };
+        let outputs = controller.poll(state.clock.show(now), sensors, frame, status);
+        let torque = if outputs.motors_enabled { outputs.torque } else { [0.0; AXES] };
+        if torque != state.commanded {
+            state.commanded = torque;
+            state.coming.push_back((now + u64::from(self.config.act_latency_us) * 1000, torque));
+        }
+        let acted = controller.stats().acted;
+        if acted != state.acted {
+            state.acted = acted;
+            state.longest_gap_ns = state.longest_gap_ns.max(now - state.acted_ns);
+            state.acted_ns = now;
+        }
+        state.next_poll_ns = state.clock.reaches(outputs.deadline).max(now + 1);
+        self.next_poll_ns = self.next_poll_ns.min(state.next_poll_ns);
+        self.pump(module, now);
+    }
+
+    /// Hands the controller's frames to its CAN port.
+    fn pump(&mut self, module: usize, now: u64) {
+        let node = self.node(module);
+        let Some(controller) = &mut self.modules[module].controller else { return };
+        while self.bus.has_room(node) {
+            let Some(frame) = controller.next_frame() else { return };
+            let function = frame.function();
+            // What still waits in the port is out of date, pieces of the same latent apart.
+            let same_latent = |waiting: &Frame| {
+                function == Some(Function::LatentFragment)
+                    && waiting.data[0] & 15 == frame.data[0] & 15
+                    && waiting.data[0] != frame.data[0]
+            };
+            self.bus.cancel(node, |waiting| waiting.id == frame.id && !same_latent(waiting));
+            let encoded = matches!(function, Some(Function::Latent | Function::LatentFragment));
+            let latency = if encoded { u64::from(self.config.encode_latency_us) * 1000 } else { 0 };
+            let _ = self.bus.send(node, &frame, now + latency);
+        }
+    }
+
+    fn view<P: Plant + ?Sized>(&self, cycle: u32, at_ns: u64, plant: &P, observer: &mut dyn FnMut(&CycleView<'_>, &P)) {
+        const NOTHING: &[u16; MAX_MODULES] = &[0; MAX_MODULES];
+        let modules: Vec<ModuleView<'_>> = self
+            .modules
+            .iter()
+            .enumerate()
+            .map(|(module, state)| {
+                let controller = state.controller.as_ref();
+                ModuleView {
+                    plugged: controller.is_some(),
+                    mode: controller.map_or(Mode::Boot, |c| c.mode()),
+                    cycle: controller.map_or(0, |c| c.cycle()),
+                    time_keeper: controller.and_then(|c| c.time_keeper()),
+                    alive: controller.map_or(0, |c| c.alive()),
+                    heard: controller.map_or(0, |c| c.heard()),
+                    attention: controller.map_or(NOTHING, |c| c.attention()),
+                    torque: state.applied.unwrap_or_default(),
+                    faults: controller.map_or(FaultSet::EMPTY, |c| c.faults()),
+                    bus: self.bus.state(self.node(module)),
+                }
+            })
+            .collect();
+        let cuts = self.active.iter().fold(0, |set, fault| match fault {
+            Fault::Cut(module) => set | 1u64.checked_shl(*module as u32).unwrap_or(0),
+            _ => set,
+        });
+        observer(&CycleView { cycle, at_ns, modules: &modules, cuts }, plant);
+    }
+
+    fn report(&self, now: u64, cut_short: bool) -> SilReport {
+        let modules: Vec<ModuleReport> = self
+            .modules
+            .iter()
+            .enumerate()
+            .map(|(module, state)| {
+                let last = state.controller.as_ref().map_or(0, |_| now.saturating_sub(state.acted_ns));
+                let node = self.node(module);
+                ModuleReport {
+                    stats: state.controller.as_ref().map_or(state.past, |c| add(&state.past, c.stats())),
+                    bus: self.bus.node_stats(node),
+                    errors: self.bus.counters(node),
+                    longest_gap_ms: state.longest_gap_ns.max(last) as f64 / 1e6,
+                }
+            })
+            .collect();
+        let age = modules.iter().map(|module| module.stats.latent_age_max_us).max().unwrap_or(0);
+        let age = if age > 0 { f64::from(age) + f64::from(self.config.act_latency_us) } else { 0.0 };
+        let stats = self.bus.stats();
+        SilReport {
+            duration_ns: now,
+            cycles: modules.iter().map(|module| module.stats.cycles).max().unwrap_or(0),
+            bus_load: self.bus.load(now),
+            latent_age_max_ms: age / 1e3,
+            deadline_misses: modules.iter().map(|module| u64::from(module.stats.deadline_misses)).sum(),
+            frames: stats.frames,
+            error_frames: stats.error_frames,
+            dropped: stats.dropped,
+            frame_latency_max_ms: stats.worst_latency_ns as f64 / 1e6,
+            faults: self.config.faults.iter().filter(|fault| fault.at_ns <= now).copied().collect(),
+            cut_short,
+            modules,
+        }
+    }
+}
+
+fn start<'a>(
+    config: &SilConfig,
+    policy: Policy<'a>,
+    module: usize,
+    count: usize,
+    now: Micros,
+) -> Result<Controller<'a>, SilError> {
+    let node = config.numbers.get(module).copied().unwrap_or(module as u8);
+    let mut setup = Config::new(node, count as u8, config.bus, &policy);
+    setup.bus_off = config.bus_off;
+    setup.timing = config.timing.unwrap_or(setup.timing);
+    Controller::new(setup, policy, now).map_err(SilError::Config)
+}
