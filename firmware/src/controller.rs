@@ -732,7 +732,7 @@ impl<'a> Controller<'a> {
                 start => {
                     // The lost time-keeper's numbers go on, so that modules that follow it without SYNC agree.
                     let gap = start.map_or(period, |start| now.saturating_sub(start));
-                    let cycles = ((gap + period / 2) / period.max(1)).max(1);
+                    let cycles = (gap.saturating_add(period / 2) / period.max(1)).max(1);
                     self.next_sync = Some(now.saturating_add(period));
                     self.send_sync(self.cycle.wrapping_add(cycles as u16), sensors);
                 }

@@ -24,7 +24,9 @@ pub fn write_whole(path: &Path, content: &[u8]) -> Result<()> {
         file.persist(path).map_err(|e| e.error)?;
         Ok(())
     };
-    attempt().with_context(|| format!("cannot write {}; is the folder there, writable, and the disk not full?", path.display()))
+    attempt().with_context(|| {
+        format!("cannot write {}; is the folder there, writable, and the disk not full?", path.display())
+    })
 }
 
 /// Creates a folder and says which one if that fails.

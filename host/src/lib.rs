@@ -9,6 +9,7 @@ pub mod freeze;
 pub mod methods;
 pub mod network;
 pub mod plot;
+pub mod recorder;
 pub mod replay;
 pub mod robot;
 pub mod run;

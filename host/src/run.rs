@@ -135,7 +135,9 @@ impl RunConfig {
         }
         let [least, most] = self.env.delay;
         if least > most || most as f32 >= substeps {
-            bail!("delay = [{least}, {most}]; it must rise and stay below the {substeps:.0} physics steps of a control step");
+            bail!(
+                "delay = [{least}, {most}]; it must rise and stay below the {substeps:.0} physics steps of a control step"
+            );
         }
         for &modules in &self.env.lengths {
             self.robot.with_modules(modules)?;

@@ -3,8 +3,8 @@
 //! `policy-format.md` beside this crate's manifest specifies every byte. [`Policy::parse`] checks an image once;
 //! afterwards nothing can fail. [`ImageWriter`] is the other direction.
 //!
-//! The network (paper, section "Method"; all modules share it) maps the observation x of a module to its latent message
-//! (k, v), and its own latent with those it heard to its two torques:
+//! The network (paper, section "Self-attention Mechanism"; shared by all modules) maps the observation x of a module to
+//! its latent message (k, v), and its own latent with those it heard to its two torques:
 //!
 //! ```text
 //! z = clip((x - mean) / std, -5, 5)          e = tanh(W_enc z + b_enc)

@@ -434,7 +434,7 @@ fn a_lost_sync_costs_nothing() {
         frame.function() == Some(Function::Sync)
             && to == 4
             && (SECOND..SECOND + 5 * PERIOD).contains(&now)
-            && now / PERIOD % 2 == 0
+            && (now / PERIOD).is_multiple_of(2)
     });
     net.run(SECOND);
     net.assert_in_step();

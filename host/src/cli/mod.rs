@@ -1,8 +1,11 @@
 //! The command line. Every verb is a thin layer over the library.
 
+mod dbc;
+mod demo;
 mod eval;
 mod export;
 mod policy_file;
+mod sil;
 mod train;
 
 use std::process::ExitCode;
@@ -13,10 +16,13 @@ pub use policy_file::PolicySource;
 
 /// Decentralised controllers for modular snake robots: train, evaluate, freeze, and prove them on a simulated CAN bus.
 #[derive(Parser)]
-#[command(name = "snakectl", version, about, max_term_width = 110)]
+#[command(name = "snakectl", version, about, max_term_width = 110, args_conflicts_with_subcommands = true)]
 struct Arguments {
     #[command(subcommand)]
     verb: Option<Verb>,
+    /// Without a verb: the demonstration
+    #[command(flatten)]
+    demonstration: demo::Arguments,
 }
 
 #[derive(Subcommand)]
@@ -27,6 +33,10 @@ enum Verb {
     Eval(eval::Arguments),
     /// Freeze a training run to an integer policy image.
     Export(export::Arguments),
+    /// Run complete controllers with a frozen policy on a simulated CAN bus.
+    Sil(sil::Arguments),
+    /// Print the bus's message database in DBC form.
+    Dbc(dbc::Arguments),
 }
 
 /// Parses the command line, runs the verb, and reports an error as one sentence.
@@ -36,7 +46,9 @@ pub fn main() -> ExitCode {
         Some(Verb::Train(arguments)) => train::run(arguments),
         Some(Verb::Eval(arguments)) => eval::run(&arguments),
         Some(Verb::Export(arguments)) => export::run(&arguments),
-        None => Ok(()),
+        Some(Verb::Sil(arguments)) => sil::run(&arguments),
+        Some(Verb::Dbc(arguments)) => dbc::run(&arguments),
+        None => demo::run(&arguments.demonstration),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

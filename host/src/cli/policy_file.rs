@@ -108,7 +108,8 @@ pub const NETWORK_FILE: &str = "network.json";
 /// Reads a settings file.
 pub fn load_config(path: &Path) -> Result<RunConfig> {
     let text = std::fs::read_to_string(path).with_context(|| format!("cannot read the settings {}", path.display()))?;
-    toml::from_str(&text).map_err(|e| anyhow::anyhow!("{} has settings that do not fit: {}", path.display(), e.message()))
+    toml::from_str(&text)
+        .map_err(|e| anyhow::anyhow!("{} has settings that do not fit: {}", path.display(), e.message()))
 }
 
 /// The settings and the network of a run folder.

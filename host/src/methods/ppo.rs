@@ -164,8 +164,10 @@ pub fn update(
     (run_seed, iteration): (u64, u64),
     threads: usize,
 ) -> UpdateStats {
-    let mut stats =
-        UpdateStats { explained_variance: estimate_advantages(lanes, learner, settings, threads), ..Default::default() };
+    let mut stats = UpdateStats {
+        explained_variance: estimate_advantages(lanes, learner, settings, threads),
+        ..Default::default()
+    };
     let (actor, critic) = (ActorLayout::new(method), CriticLayout::default());
     standardise(lanes);
 
@@ -205,7 +207,8 @@ pub fn update(
             let chunks: Vec<_> = minibatch.chunks(CHUNK).collect();
             let gradients = parallel(&chunks, threads, |chunk| {
                 let batch = gather(lanes, chunk, modules, weight, |r| norm.normalise(r));
-                let of_actor = if with_actor { actor.gradient(&learner.actor, &batch, loss) } else { Gradient::default() };
+                let of_actor =
+                    if with_actor { actor.gradient(&learner.actor, &batch, loss) } else { Gradient::default() };
                 let of_critic = if with_critic {
                     critic.gradient(&learner.critic, &batch, 1.0 / minibatch.len() as f32)
                 } else {
@@ -270,5 +273,225 @@ fn standardise(lanes: &mut [Lane]) {
         for advantage in &mut lane.advantages {
             *advantage = ((f64::from(*advantage) - mean) / (std + 1e-8)) as f32;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::environment::{Environment, Told, Trivial};
+    use crate::methods::actor_critic::{CRITIC_INPUT, OUT};
+    use crate::methods::inference::Inference;
+    use crate::methods::normalise::Running;
+    use crate::methods::rollout::{Frozen, Iteration, Slot, collect};
+    use composer_shared::observation::SIZE;
+
+    /// A rollout of teams of different sizes, one of them with a dead module, under a policy that is not the initial one.
+    fn rollout(method: Method) -> (Learner, Vec<Lane>) {
+        let mut learner = Learner::new(method, 5, 0.45, 1e-5);
+        let mut rng = stream(9, Stream::Weights, 7, 7);
+        learner.actor.iter_mut().chain(&mut learner.critic).for_each(|p| *p += 0.3 * (rng.random::<f32>() - 0.5));
+        let teams: [Box<dyn Environment>; 3] = [
+            Box::new(Trivial::new(4, Told::Head)),
+            Box::new(Trivial::new(3, Told::All)),
+            Box::new(Trivial::new(5, Told::Head).with_dead(2)),
+        ];
+        let mut slots: Vec<_> = teams.into_iter().enumerate().map(|(i, team)| Slot::new(team, i, 5)).collect();
+        let mut lanes = vec![Lane::default(); 3];
+        let (mut observations, mut privileged) = (Running::new(SIZE), Running::new(crate::environment::PRIVILEGED));
+        let iteration = Iteration {
+            policy: &Inference::new(&ActorLayout::new(method), &learner.actor),
+            observations: Frozen::new(&observations),
+            privileged: Frozen::new(&privileged),
+            run_seed: 5,
+            iteration: 0,
+            steps: 16,
+        };
+        collect(&mut slots, &mut lanes, iteration, 2, &mut observations, &mut privileged);
+        (learner, lanes)
+    }
+
+    const SETTINGS: PpoSettings = PpoSettings {
+        minibatches: 2,
+        epochs: 2,
+        critic_epochs: 2,
+        gamma: 0.9,
+        lambda: 0.9,
+        clip: 0.2,
+        kl_stop: 1.0,
+        entropy: 0.0,
+        actor_grad_norm: 0.5,
+        critic_grad_norm: 1.0,
+    };
+
+    #[test]
+    fn ratio_is_one_on_the_first_minibatch_with_masks_and_padding() {
+        for method in Method::ALL {
+            let (learner, lanes) = rollout(method);
+            let batch = gather(&lanes, &all_samples(&lanes), 5, 1.0, |r| r);
+            let layout = ActorLayout::new(method);
+            let means = layout.means(&learner.actor, &batch);
+            let log_sigma = [0, 1].map(|i| learner.actor[layout.log_sigma.offset + i]);
+            let mut checked = 0;
+            for (row, weight) in batch.weights.iter().enumerate() {
+                if *weight > 0.0 {
+                    let pair = |v: &[f32]| -> [f32; OUT] { [v[row * OUT], v[row * OUT + 1]] };
+                    let new =
+                        crate::methods::actor_critic::log_probability(pair(&batch.actions), pair(&means), log_sigma);
+                    let ratio = (new - batch.log_probabilities[row]).exp();
+                    assert!((ratio - 1.0).abs() < 1e-4, "{method} row {row}: {ratio}");
+                    checked += 1;
+                }
+            }
+            assert_eq!(checked, 16 * (4 + 3 + 4));
+            // The same seen from the loss: no divergence, nothing clipped.
+            let first = layout.gradient(&learner.actor, &batch, PpoLoss { clip: 0.2 });
+            assert!(first.kl.abs() < 1e-6 && first.clipped == 0.0, "{first:?}");
+        }
+    }
+
+    #[test]
+    fn attention_needs_the_masks_of_the_rollout() {
+        let (learner, lanes) = rollout(Method::ComposerNoImagination);
+        let mut batch = gather(&lanes, &all_samples(&lanes), 5, 1.0, |r| r);
+        let layout = ActorLayout::new(Method::ComposerNoImagination);
+        let right = layout.means(&learner.actor, &batch);
+        // Padding must not matter ...
+        let tight = gather(&lanes[1..2], &[(0, 3)], 3, 1.0, |r| r);
+        let loose = gather(&lanes[1..2], &[(0, 3)], 5, 1.0, |r| r);
+        let (tight, loose) = (layout.means(&learner.actor, &tight), layout.means(&learner.actor, &loose));
+        assert!(tight.iter().zip(&loose).all(|(a, b)| (a - b).abs() < 1e-6));
+        // ... but who hears whom must.
+        batch.heard.iter_mut().for_each(|heard| *heard = 0b11111);
+        let wrong = layout.means(&learner.actor, &batch);
+        assert!(right.iter().zip(&wrong).any(|(a, b)| (a - b).abs() > 1e-3));
+    }
+
+    /// A batch whose ratios lie on both sides of the clip, with advantages of both signs.
+    fn shaken(lanes: &mut [Lane]) -> Batch {
+        let mut rng = stream(3, Stream::Shuffle, 0, 0);
+        let samples = all_samples(lanes);
+        for lane in &mut *lanes {
+            lane.advantages = (0..lane.steps()).map(|_| rng.random_range(-1.0..1.0)).collect();
+            lane.returns = (0..lane.steps()).map(|_| rng.random_range(-1.0..1.0)).collect();
+            // Ratios of 0.67, 0.9, 1.1 and 1.5: none so near the edges of the clip that a small step crosses one.
+            let offsets = [-0.4, -0.1, 0.1, 0.4];
+            lane.log_probabilities.iter_mut().for_each(|l| *l += offsets[rng.random_range(0..4)]);
+        }
+        gather(lanes, &samples, 5, 1.0 / 176.0, |r| 0.5 * r)
+    }
+
+    /// Compares a gradient with central differences of the loss, along each of some single parameters and along the gradient.
+    fn against_differences(
+        parameters: &[f32],
+        gradient: &[f32],
+        loss: impl Fn(&[f32]) -> f64,
+        blocks: &[crate::methods::Block],
+    ) {
+        let slope = |direction: &dyn Fn(usize) -> f32, h: f32| {
+            let moved = |sign: f32| -> Vec<f32> {
+                parameters.iter().enumerate().map(|(i, p)| p + sign * h * direction(i)).collect()
+            };
+            (loss(&moved(1.0)) - loss(&moved(-1.0))) / (2.0 * f64::from(h))
+        };
+        for block in blocks.iter().filter(|block| !block.is_empty()) {
+            // Along the gradient of this block: the slope is its norm.
+            let norm = gradient[block.range()].iter().map(|g| f64::from(*g).powi(2)).sum::<f64>().sqrt();
+            assert!(norm > 1e-5, "{} has no gradient", block.name);
+            let inside = |i: usize| if block.range().contains(&i) { gradient[i] / norm as f32 } else { 0.0 };
+            let along = slope(&inside, 4e-3);
+            assert!((along - norm).abs() < 0.03 * norm + 2e-4, "{}: norm {norm}, slope {along}", block.name);
+            // And at its largest single parameter.
+            let largest = block.range().max_by(|a, b| gradient[*a].abs().total_cmp(&gradient[*b].abs())).unwrap();
+            let single = slope(&|i| if i == largest { 1.0 } else { 0.0 }, 1e-2);
+            let expected = f64::from(gradient[largest]);
+            assert!(
+                (single - expected).abs() < 0.05 * expected.abs() + 2e-4,
+                "{}: {expected}, slope {single}",
+                block.name
+            );
+        }
+    }
+
+    #[test]
+    fn the_gradient_of_the_clipped_loss_is_its_slope() {
+        for method in Method::ALL {
+            let (learner, mut lanes) = rollout(method);
+            let batch = shaken(&mut lanes);
+            let layout = ActorLayout::new(method);
+            // The loss again, in double precision and from its formula.
+            let loss = |parameters: &[f32]| -> f64 {
+                let means = layout.means(parameters, &batch);
+                let log_sigma = [0, 1].map(|i| parameters[layout.log_sigma.offset + i]);
+                let mut sum = 0.0;
+                for row in 0..batch.weights.len() {
+                    let pair = |v: &[f32]| -> [f32; OUT] { [v[row * OUT], v[row * OUT + 1]] };
+                    let new =
+                        crate::methods::actor_critic::log_probability(pair(&batch.actions), pair(&means), log_sigma);
+                    let ratio = f64::from(new - batch.log_probabilities[row]).exp();
+                    let advantage = f64::from(batch.advantages[row / batch.modules]);
+                    let gain = (ratio * advantage).min(ratio.clamp(0.8, 1.2) * advantage);
+                    sum -= gain * f64::from(batch.weights[row]);
+                }
+                sum
+            };
+            let result = layout.gradient(&learner.actor, &batch, PpoLoss { clip: 0.2 });
+            assert!((result.loss - loss(&learner.actor)).abs() < 1e-5);
+            assert!(result.clipped > 0.1 && result.clipped < 0.9, "{}", result.clipped);
+            against_differences(&learner.actor, &result.gradient, loss, &layout.blocks());
+        }
+    }
+
+    #[test]
+    fn the_gradient_of_the_value_loss_is_its_slope() {
+        let (learner, mut lanes) = rollout(Method::Mappo);
+        let batch = shaken(&mut lanes);
+        let layout = CriticLayout::default();
+        let loss = |parameters: &[f32]| -> f64 {
+            let values = layout.values(parameters, &batch);
+            values.iter().zip(&batch.targets).map(|(v, t)| 0.25 * f64::from(v - t).powi(2)).sum()
+        };
+        let result = layout.gradient(&learner.critic, &batch, 0.5);
+        assert!((result.loss - loss(&learner.critic)).abs() < 1e-4);
+        against_differences(&learner.critic, &result.gradient, loss, &layout.blocks());
+    }
+
+    #[test]
+    fn rescaling_the_critic_keeps_its_values() {
+        let (mut learner, mut lanes) = rollout(Method::Mappo);
+        let batch = shaken(&mut lanes);
+        let layout = CriticLayout::default();
+        let before = layout.values(&learner.critic, &batch);
+        layout.rescale(&mut learner.critic, [1.0, 2.0], [-3.0, 5.0]);
+        let after = layout.values(&learner.critic, &batch);
+        for (before, after) in before.iter().zip(&after) {
+            assert!((before * 2.0 + 1.0 - (after * 5.0 - 3.0)).abs() < 1e-4);
+        }
+        assert_eq!(batch.critic_inputs.len(), batch.samples * 5 * CRITIC_INPUT);
+    }
+
+    #[test]
+    fn an_update_does_not_depend_on_the_threads() {
+        let results = [1, 2, 3].map(|threads| {
+            let (mut learner, mut lanes) = rollout(Method::ComposerNoImagination);
+            let stats =
+                update(&mut learner, Method::ComposerNoImagination, &mut lanes, &SETTINGS, 1e-3, (5, 0), threads);
+            (learner, stats)
+        });
+        assert_eq!(results[0], results[1]);
+        assert_eq!(results[0], results[2]);
+        let stats = results[0].1;
+        assert_eq!(stats.actor_minibatches, 4);
+        assert!(stats.first_kl.abs() < 1e-6, "{stats:?}");
+    }
+
+    #[test]
+    fn the_actor_stops_at_the_kl_limit() {
+        let (mut learner, mut lanes) = rollout(Method::Mappo);
+        let settings = PpoSettings { kl_stop: 1e-4, epochs: 10, ..SETTINGS };
+        let stats = update(&mut learner, Method::Mappo, &mut lanes, &settings, 1e-2, (5, 0), 1);
+        assert!(stats.actor_minibatches < 20 && stats.approx_kl > 1e-4, "{stats:?}");
+        assert_eq!(learner.critic_adam.steps, 4);
+        assert_eq!(learner.actor_adam.steps, stats.actor_minibatches as u64);
     }
 }

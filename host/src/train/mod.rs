@@ -48,27 +48,27 @@ pub struct TrainConfig {
     /// Epochs of the critic.
     pub critic_epochs: usize,
     /// Discount per control step, 0 to 1. Higher looks further ahead and learns slower.
-    pub gamma: f32,
+    pub gamma: f64,
     /// Decay of generalised advantage estimation, 0 to 1.
-    pub lambda: f32,
+    pub lambda: f64,
     /// Ratios of new to old density count up to 1 +- this.
-    pub clip: f32,
+    pub clip: f64,
     /// Estimated KL divergence at which the actor stops learning from an iteration.
-    pub kl_stop: f32,
+    pub kl_stop: f64,
     /// Adam's learning rate at the start.
-    pub learning_rate: f32,
+    pub learning_rate: f64,
     /// Share of it that is left at the end; linear in between.
-    pub learning_rate_end: f32,
+    pub learning_rate_end: f64,
     /// Adam's epsilon.
-    pub adam_epsilon: f32,
+    pub adam_epsilon: f64,
     /// Limit of the norm of the actor's gradient, over all its parameters.
-    pub actor_grad_norm: f32,
+    pub actor_grad_norm: f64,
     /// The same for the critic.
-    pub critic_grad_norm: f32,
+    pub critic_grad_norm: f64,
     /// Weight of the entropy bonus.
-    pub entropy: f32,
+    pub entropy: f64,
     /// Standard deviation of the actions at the start, as a fraction of the torque limit.
-    pub sigma: f32,
+    pub sigma: f64,
     /// Environment steps between two evaluations; 0 for none.
     pub evaluate_every: u64,
     /// Seconds between two checkpoints.
@@ -193,7 +193,7 @@ impl TrainConfig {
     /// Learning rate of an iteration.
     pub fn learning_rate_at(&self, iteration: u64) -> f32 {
         let done = iteration as f64 / self.iterations().max(1) as f64;
-        (f64::from(self.learning_rate) * (1.0 - done * (1.0 - f64::from(self.learning_rate_end)))) as f32
+        (self.learning_rate * (1.0 - done * (1.0 - self.learning_rate_end))) as f32
     }
 
     /// The part that the update needs.
@@ -202,13 +202,13 @@ impl TrainConfig {
             minibatches: self.minibatches,
             epochs: self.epochs,
             critic_epochs: self.critic_epochs,
-            gamma: self.gamma,
-            lambda: self.lambda,
-            clip: self.clip,
-            kl_stop: self.kl_stop,
-            entropy: self.entropy,
-            actor_grad_norm: self.actor_grad_norm,
-            critic_grad_norm: self.critic_grad_norm,
+            gamma: self.gamma as f32,
+            lambda: self.lambda as f32,
+            clip: self.clip as f32,
+            kl_stop: self.kl_stop as f32,
+            entropy: self.entropy as f32,
+            actor_grad_norm: self.actor_grad_norm as f32,
+            critic_grad_norm: self.critic_grad_norm as f32,
         }
     }
 }
@@ -273,7 +273,7 @@ impl Trainer {
             slots.push(Slot::new(checked(make(index)?, index)?, index, config.seed));
         }
         Ok(Self {
-            learner: Learner::new(config.method, config.seed, config.sigma, config.adam_epsilon),
+            learner: Learner::new(config.method, config.seed, config.sigma as f32, config.adam_epsilon as f32),
             observations: Running::new(SIZE),
             privileged: Running::new(PRIVILEGED),
             lanes: vec![Lane::default(); config.environments],
@@ -286,7 +286,12 @@ impl Trainer {
 
     /// A run as a checkpoint has it. The settings must be those of the checkpoint; only how long it runs, how often it evaluates and
     /// saves, and the threads may differ.
-    pub fn resume(checkpoint: &Checkpoint, config: &TrainConfig, make: MakeEnvironment, fingerprint: &str) -> Result<Self> {
+    pub fn resume(
+        checkpoint: &Checkpoint,
+        config: &TrainConfig,
+        make: MakeEnvironment,
+        fingerprint: &str,
+    ) -> Result<Self> {
         if checkpoint.fingerprint != fingerprint {
             bail!(
                 "the checkpoint is of another robot or task: it was trained for `{}`, this is `{fingerprint}`",
@@ -317,7 +322,11 @@ impl Trainer {
             (&mut learner.critic_adam.second, critic_second),
         ] {
             if to.len() != from.len() {
-                bail!("the checkpoint has {} parameters where this version of the network has {}", from.len(), to.len());
+                bail!(
+                    "the checkpoint has {} parameters where this version of the network has {}",
+                    from.len(),
+                    to.len()
+                );
             }
             to.clone_from(from);
         }
@@ -335,7 +344,11 @@ impl Trainer {
         };
         (trainer.observations, trainer.privileged, trainer.learner.value_norm) = (observations, privileged, value_norm);
         if checkpoint.episodes.len() != config.environments {
-            bail!("the checkpoint has {} environments, the settings say {}", checkpoint.episodes.len(), config.environments);
+            bail!(
+                "the checkpoint has {} environments, the settings say {}",
+                checkpoint.episodes.len(),
+                config.environments
+            );
         }
         for (index, episode) in checkpoint.episodes.iter().enumerate() {
             let environment = checked(make(index)?, index)?;
@@ -585,7 +598,8 @@ impl Signals {
                     .context("no handler for Ctrl-C can be set up")?,
             );
             registered.push(
-                signal_hook::flag::register(signal, Arc::clone(&flag)).context("no handler for Ctrl-C can be set up")?,
+                signal_hook::flag::register(signal, Arc::clone(&flag))
+                    .context("no handler for Ctrl-C can be set up")?,
             );
         }
         Ok(Self { flag, registered })
@@ -601,5 +615,202 @@ impl Drop for Signals {
         for id in self.registered.drain(..) {
             signal_hook::low_level::unregister(id);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::environment::{Told, Trivial, View};
+
+    fn small(method: Method) -> TrainConfig {
+        TrainConfig {
+            method,
+            environments: 4,
+            rollout_steps: 24,
+            minibatches: 2,
+            epochs: 2,
+            critic_epochs: 2,
+            ..Default::default()
+        }
+    }
+
+    /// Teams of different sizes, one with a dead module.
+    fn teams(index: usize) -> Result<Box<dyn Environment>> {
+        let team = Trivial::new(3 + index % 3, Told::Head);
+        Ok(Box::new(if index == 2 { team.with_dead(1) } else { team }))
+    }
+
+    #[test]
+    fn six_iterations_are_three_and_a_resumption_and_three() {
+        for method in Method::ALL {
+            let config = TrainConfig { total_steps: 6 * 96, ..small(method) };
+            let mut straight = Trainer::new(&config, &teams, "trivial").unwrap();
+            let reports: Vec<_> = (0..6).map(|_| straight.iterate().unwrap().scalars).collect();
+
+            let folder = tempfile::tempdir().unwrap();
+            let mut first = Trainer::new(&TrainConfig { threads: 1, ..config.clone() }, &teams, "trivial").unwrap();
+            for expected in &reports[..3] {
+                // NaN is not equal to itself; the text is.
+                assert_eq!(format!("{:?}", first.iterate().unwrap().scalars), format!("{expected:?}"));
+            }
+            first.checkpoint().unwrap().write(folder.path()).unwrap();
+            drop(first);
+            let checkpoint = Checkpoint::read(folder.path()).unwrap();
+            assert!(checkpoint.episodes.iter().any(|episode| !episode.actions.is_empty()));
+            let mut second = Trainer::resume(&checkpoint, &config, &teams, "trivial").unwrap();
+            for expected in &reports[3..] {
+                assert_eq!(format!("{:?}", second.iterate().unwrap().scalars), format!("{expected:?}"));
+            }
+            assert_eq!(second.checkpoint().unwrap(), straight.checkpoint().unwrap());
+            assert_eq!(second.network(), straight.network());
+        }
+    }
+
+    #[test]
+    fn a_whole_run_can_be_stopped_and_resumed_through_its_folder() {
+        let make: MakeEnvironment = &teams;
+        let quiet = |_: &Network, steps: u64| vec![("eval/steps".to_string(), steps as f64)];
+        let config = TrainConfig { total_steps: 4 * 96, evaluate_every: 200, ..small(Method::Mappo) };
+        let (a, b) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        let whole = train(&config, make, "trivial", a.path(), false, &mut { quiet }).unwrap();
+        assert_eq!((whole.steps, whole.iterations, whole.interrupted), (384, 4, false));
+        assert_eq!(whole.evaluation, [("eval/steps".to_string(), 384.0)]);
+
+        // The learning rate depends on the length of the run, so the half run must know the whole length: stop it by hand.
+        let mut half = Trainer::new(&config, make, "trivial").unwrap();
+        half.iterate().unwrap();
+        half.iterate().unwrap();
+        half.checkpoint().unwrap().write(b.path()).unwrap();
+        let resumed = train(&config, make, "trivial", b.path(), true, &mut { quiet }).unwrap();
+        assert_eq!(resumed.network, whole.network);
+        assert_eq!(Checkpoint::read(a.path()).unwrap(), Checkpoint::read(b.path()).unwrap());
+        let lines = std::fs::read_to_string(b.path().join(metrics::FILE)).unwrap();
+        assert_eq!(lines.lines().count(), 2, "{lines}");
+        assert!(lines.contains("losses/approx_kl"), "{lines}");
+    }
+
+    #[test]
+    fn what_cannot_be_resumed_is_refused_with_a_reason() {
+        let config = small(Method::Mappo);
+        let checkpoint = Trainer::new(&config, &teams, "trivial").unwrap().checkpoint().unwrap();
+        let refused = |config: &TrainConfig, fingerprint: &str| {
+            Trainer::resume(&checkpoint, config, &teams, fingerprint).err().unwrap().to_string()
+        };
+        assert!(refused(&config, "snake").contains("another robot or task"));
+        let changed = TrainConfig { gamma: 0.5, total_steps: 7, ..config.clone() };
+        let error = refused(&changed, "trivial");
+        assert!(error.contains("gamma (it was 0.97)") && !error.contains("total_steps"), "{error}");
+        let longer = TrainConfig { total_steps: 2_000_000, threads: 3, ..config.clone() };
+        assert!(Trainer::resume(&checkpoint, &longer, &teams, "trivial").is_ok());
+
+        let folder = tempfile::tempdir().unwrap();
+        let run = |resume| {
+            train(&config, &teams, "trivial", folder.path(), resume, &mut |_, _| Vec::new()).err().unwrap().to_string()
+        };
+        assert!(run(true).contains("holds no checkpoint"));
+        checkpoint.write(folder.path()).unwrap();
+        assert!(run(false).contains("already holds a run"));
+    }
+
+    #[test]
+    fn settings_are_set_by_name_and_checked() {
+        let mut config = TrainConfig::default();
+        config.set("learning_rate=3e-4").unwrap();
+        config.set("gamma = 1").unwrap();
+        config.set("method=mappo").unwrap();
+        config.set("environments=8").unwrap();
+        assert_eq!((config.learning_rate, config.gamma, config.environments), (3e-4, 1.0, 8));
+        assert_eq!(config.method, Method::Mappo);
+        for (assignment, complaint) in [
+            ("gamma", "key=value"),
+            ("gama=0.9", "no setting `gama`"),
+            ("gamma=high", "gamma=high is not possible"),
+            ("environments=-1", "environments=-1 is not possible"),
+            ("method=ppo2", "composer-no-imagination"),
+        ] {
+            let error = config.set(assignment).unwrap_err().to_string();
+            assert!(error.contains(complaint), "{error}");
+        }
+        config.validate().unwrap();
+        for (assignment, complaint) in [
+            ("gamma=1.5", "gamma is 1.5; it must be from 0 to 1"),
+            ("environments=0", "environments is 0"),
+            ("minibatches=1000000", "minibatches is 1000000"),
+            ("sigma=0", "sigma is 0"),
+            ("total_steps=0", "total_steps is 0"),
+            ("learning_rate=nan", "learning_rate is NaN"),
+        ] {
+            let mut config = TrainConfig::default();
+            config.set(assignment).unwrap();
+            let error = config.validate().unwrap_err().to_string();
+            assert!(error.contains(complaint), "{error}");
+        }
+        assert!(toml::from_str::<TrainConfig>("gammma = 1.0").unwrap_err().message().contains("gammma"));
+        assert_eq!(
+            config_of(&Trainer::new(&small(Method::Mappo), &teams, "x").unwrap().checkpoint().unwrap()).unwrap(),
+            small(Method::Mappo)
+        );
+    }
+
+    #[test]
+    fn the_learning_rate_falls_linearly() {
+        let config =
+            TrainConfig { total_steps: 20_480, learning_rate: 1.0, learning_rate_end: 0.1, ..Default::default() };
+        assert_eq!(config.iterations(), 10);
+        assert_eq!(config.learning_rate_at(0), 1.0);
+        assert!((config.learning_rate_at(5) - 0.55).abs() < 1e-6);
+    }
+
+    /// Mean reward of a policy without noise on episodes it was not trained on.
+    fn reward(network: &Network, modules: usize, told: Told) -> f32 {
+        let mut team = Trivial::new(modules, told);
+        let mut view = View::default();
+        let mut actions = vec![[0.0; 2]; modules];
+        let total: f32 = (0..200)
+            .map(|seed| {
+                team.reset(seed);
+                team.view(&mut view);
+                network.act(&view.observations, &view.heard, &mut actions, None);
+                team.step(&actions).reward
+            })
+            .sum();
+        total / 200.0
+    }
+
+    fn learn(method: Method, told: Told) -> Network {
+        let config = TrainConfig {
+            method,
+            total_steps: 30_000,
+            environments: 16,
+            rollout_steps: 20,
+            learning_rate: 1e-3,
+            gamma: 0.0,
+            ..Default::default()
+        };
+        let mut trainer = Trainer::new(&config, &|_| Ok(Box::new(Trivial::new(4, told))), "trivial").unwrap();
+        while trainer.iteration() < config.iterations() {
+            trainer.iterate().unwrap();
+        }
+        trainer.network()
+    }
+
+    #[test]
+    fn both_methods_solve_the_trivial_task() {
+        for method in Method::ALL {
+            let network = learn(method, Told::All);
+            let reward = reward(&network, 4, Told::All);
+            assert!(reward > 0.95, "{method}: {reward}");
+        }
+    }
+
+    #[test]
+    fn only_attention_carries_the_target_from_the_head() {
+        let reward_of = |method| reward(&learn(method, Told::Head), 4, Told::Head);
+        let attention = reward_of(Method::ComposerNoImagination);
+        assert!(attention > 0.95, "{attention}");
+        // Three of four modules can do no better than zero: 1 - 3/4 * 1/3.
+        let alone = reward_of(Method::Mappo);
+        assert!(alone < 0.8, "{alone}");
     }
 }

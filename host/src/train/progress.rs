@@ -59,7 +59,9 @@ impl Progress {
     pub fn new(total: u64, done: u64) -> Self {
         let bar = std::io::stderr().is_terminal().then(|| {
             let bar = ProgressBar::new(total).with_position(done).with_elapsed(Duration::ZERO);
-            if let Ok(style) = ProgressStyle::with_template("{bar:30} {human_pos}/{human_len} steps, {eta} left | {msg}") {
+            if let Ok(style) =
+                ProgressStyle::with_template("{bar:30} {human_pos}/{human_len} steps, {eta} left | {msg}")
+            {
                 bar.set_style(style);
             }
             bar.reset_eta();

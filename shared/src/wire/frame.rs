@@ -197,6 +197,9 @@ impl fmt::Display for WireError {
             WireError::WrongSender { function, module: STATION } => {
                 write!(f, "{} came from the station, but only modules send it", function.name())
             }
+            WireError::WrongSender { function: Function::EmergencyStop, module } => {
+                write!(f, "EMERGENCY_STOP with a release came from module {module}, but only the station sends it")
+            }
             WireError::WrongSender { function, module } => {
                 write!(f, "{} came from module {module}, but only the station sends it", function.name())
             }

@@ -19,9 +19,12 @@ mod message;
 pub use frame::{Frame, Function, STATION, WireError};
 pub use layout::{Field, LAYOUTS, Layout, Senders, dbc};
 pub use message::{
-    ANGLE_LSB, EmergencyStop, FRAGMENTS, Fault, Fragment, GOAL_LSB, Goal, Health, Heartbeat, LATENT_SIZE, LatentMessage,
-    LimitedBy, Message, Mode, NOBODY, State, StopCommand, Sync, Telemetry, quantise_angle,
+    ANGLE_LSB, EmergencyStop, FRAGMENTS, Fault, Fragment, GOAL_LSB, Goal, Health, Heartbeat, LATENT_SIZE,
+    LatentMessage, LimitedBy, Message, Mode, NOBODY, State, StopCommand, Sync, Telemetry, quantise_angle,
 };
 
 /// Version of this format; travels in every HEARTBEAT. It changes when a byte of an existing frame changes its meaning.
 pub const PROTOCOL_VERSION: u8 = 1;
+
+#[cfg(test)]
+mod tests;

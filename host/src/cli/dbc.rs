@@ -1,0 +1,20 @@
+//! `snakectl dbc`: the message database for CAN tools, generated from the wire format.
+
+use anyhow::Result;
+use composer_shared::wire;
+
+/// Arguments of `dbc`.
+#[derive(clap::Args, Clone, Debug)]
+pub struct Arguments {
+    /// Modules on the bus
+    #[arg(long, default_value_t = 8, value_parser = clap::value_parser!(u8).range(1..=64))]
+    modules: u8,
+}
+
+/// Runs the verb.
+pub fn run(arguments: &Arguments) -> Result<()> {
+    let mut text = String::new();
+    wire::dbc(&mut text, arguments.modules)?;
+    print!("{text}");
+    Ok(())
+}

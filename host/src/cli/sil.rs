@@ -1,0 +1,257 @@
+//! `snakectl sil`: complete controllers, each with the frozen policy, on a simulated CAN bus.
+
+use std::io::Write;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Instant;
+
+use anyhow::{Context, Result, bail};
+use composer_firmware::controller::BusKind;
+use composer_sim_bridge::faults::{FaultKind, PlannedFault};
+use composer_sim_bridge::frame_bits::BitRates;
+use composer_sim_bridge::sil::{self, SilConfig, SilReport};
+use serde::Serialize;
+
+use super::PolicySource;
+use super::eval::{Common, table};
+use crate::env::EnvConfig;
+use crate::eval::{Episode, Report, episode_seed, parallel};
+use crate::files::write_whole;
+use crate::recorder::Recorder;
+use crate::sil::SnakePlant;
+
+/// Kind of bus, on the command line.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum Bus {
+    /// Classic CAN: 8-byte frames, a latent in 8 fragments.
+    Classic,
+    /// CAN-FD with bit-rate switching: a latent in one frame.
+    #[default]
+    Fd,
+}
+
+/// The bus and its faults.
+#[derive(clap::Args, Clone, Debug, Default)]
+pub struct BusOptions {
+    /// Kind of bus
+    #[arg(long, value_enum, default_value_t = Bus::Fd)]
+    pub bus: Bus,
+    /// Nominal bit rate, bit/s [default: 1000000]
+    #[arg(long, value_name = "B")]
+    pub bitrate: Option<u32>,
+    /// Bit rate of the data phase of CAN-FD, bit/s [default: 5000000]
+    #[arg(long, value_name = "B")]
+    pub data_bitrate: Option<u32>,
+    /// Receivers lose frames with this probability
+    #[arg(long, value_name = "P")]
+    pub drop: Option<f64>,
+    /// Receivers see frames up to this many milliseconds late
+    #[arg(long, value_name = "MS")]
+    pub delay: Option<f64>,
+}
+
+/// Arguments of `sil`.
+#[derive(clap::Args, Clone, Debug)]
+pub struct Arguments {
+    #[command(flatten)]
+    common: Common,
+    #[command(flatten)]
+    bus: BusOptions,
+    /// Write the frames of the first episode as a candump log
+    #[arg(long, value_name = "FILE")]
+    capture: Option<PathBuf>,
+    /// Write the first episodes as one HTML page to look at
+    #[arg(long, value_name = "FILE")]
+    replay: Option<PathBuf>,
+}
+
+/// Episodes in a replay.
+pub const REPLAYED: usize = 4;
+
+/// Results on the bus: those of `eval`, and the bus's own.
+#[derive(Clone, Debug, Serialize)]
+pub struct BusReport {
+    /// As `eval` reports.
+    #[serde(flatten)]
+    pub task: Report,
+    /// "classic" or "fd".
+    pub bus: &'static str,
+    /// Share of the time in which the bus was busy, mean over the episodes.
+    pub bus_load: f64,
+    /// Largest age of a latent when it was acted on, ms.
+    pub latent_age_max_ms: f64,
+    /// Times that a live neighbour's latent was missing when a module acted.
+    pub deadline_misses: u64,
+    /// Error frames on the bus.
+    pub error_frames: u64,
+    /// Virtual time by wall time of one thread, physics included.
+    pub realtime_factor: f64,
+}
+
+/// Everything that defines a set of episodes on the bus.
+pub struct BusTrial<'a> {
+    /// The environment.
+    pub config: Arc<EnvConfig>,
+    /// The policy image.
+    pub image: &'a [u8],
+    /// Episodes, seed, faults.
+    pub common: &'a Common,
+    /// The bus.
+    pub bus: &'a BusOptions,
+    /// How many of the first episodes to record.
+    pub record: usize,
+}
+
+/// One episode on the bus, and how long it took.
+struct Run {
+    episode: Episode,
+    report: SilReport,
+    wall: f64,
+    recorded: Option<crate::replay::Episode>,
+}
+
+impl BusTrial<'_> {
+    fn sil_config(&self, seed: u64) -> SilConfig {
+        let kind = if self.bus.bus == Bus::Fd { BusKind::Fd } else { BusKind::Classic };
+        let mut sil = SilConfig::new(kind);
+        if let Some(nominal) = self.bus.bitrate {
+            sil.rates = BitRates { nominal, data: sil.rates.data.max(nominal) };
+        }
+        if let Some(data) = self.bus.data_bitrate {
+            sil.rates.data = data;
+        }
+        let mut plan = self.common.fault.clone();
+        let planned = |kind| PlannedFault { kind, at_ns: None, until_ns: None };
+        plan.faults.extend(self.bus.drop.map(|p| planned(FaultKind::Drop(p))));
+        plan.faults.extend(self.bus.delay.map(|ms| planned(FaultKind::Delay((ms * 1e6) as u64))));
+        sil.faults = plan.draw(seed, self.config.robot.modules);
+        sil.seed = seed;
+        sil
+    }
+
+    fn episode(&self, index: usize, capture: Option<&mut dyn Write>) -> Result<Run> {
+        let seed = episode_seed(self.common.seed, index as u64);
+        let sil = self.sil_config(seed);
+        let mut plant = SnakePlant::new(self.config.clone(), seed);
+        let mut recorder =
+            (index < self.record).then(|| Recorder::new(&format!("episode {}", index + 1), &plant, &sil.faults));
+        let start = Instant::now();
+        let report = sil::run(&mut plant, self.image, &sil, capture, &mut |cycle, plant| {
+            if let Some(recorder) = &mut recorder {
+                recorder.cycle(cycle, plant);
+            }
+        })?;
+        let wall = start.elapsed().as_secs_f64();
+        let episode = plant.episode();
+        let recorded = recorder.map(|r| r.finish(&episode, &report));
+        Ok(Run { episode, report, wall, recorded })
+    }
+
+    /// Runs all episodes. `progress` is called after each.
+    pub fn run(
+        &self,
+        capture: Option<&mut dyn Write>,
+        progress: &(dyn Fn() + Sync),
+    ) -> Result<(BusReport, Vec<crate::replay::Episode>)> {
+        let episodes = self.common.episodes as usize;
+        self.common.fault.check(self.config.robot.modules)?;
+        for (name, p) in [("drop", self.bus.drop)] {
+            if p.is_some_and(|p| !(0.0..=1.0).contains(&p)) {
+                bail!("--{name} is a probability: 0 to 1");
+            }
+        }
+        if self.bus.delay.is_some_and(|ms| !(0.0..=1000.0).contains(&ms)) {
+            bail!("--delay is 0 to 1000 ms");
+        }
+        let mut runs = Vec::with_capacity(episodes);
+        let alone = usize::from(capture.is_some());
+        if capture.is_some() {
+            runs.push(self.episode(0, capture)?);
+            progress();
+        }
+        let threads = self.common.threads.unwrap_or_else(super::cores);
+        let rest = parallel(episodes - alone, threads, |index| {
+            let run = self.episode(index + alone, None);
+            progress();
+            run
+        });
+        for run in rest {
+            runs.push(run?);
+        }
+        let n = runs.len() as f64;
+        let episodes: Vec<Episode> = runs.iter().map(|r| r.episode).collect();
+        let virtual_time: f64 = runs.iter().map(|r| r.report.duration_ns as f64 * 1e-9).sum();
+        let report = BusReport {
+            task: Report::new(&episodes, self.config.robot.modules, &self.common.fault.to_string()),
+            bus: if self.bus.bus == Bus::Fd { "fd" } else { "classic" },
+            bus_load: runs.iter().map(|r| r.report.bus_load).sum::<f64>() / n,
+            latent_age_max_ms: runs.iter().map(|r| r.report.latent_age_max_ms).fold(0.0, f64::max),
+            deadline_misses: runs.iter().map(|r| r.report.deadline_misses).sum(),
+            error_frames: runs.iter().map(|r| r.report.error_frames).sum(),
+            realtime_factor: virtual_time / runs.iter().map(|r| r.wall).sum::<f64>().max(1e-9),
+        };
+        Ok((report, runs.into_iter().filter_map(|r| r.recorded).collect()))
+    }
+}
+
+/// Runs the verb.
+pub fn run(arguments: &Arguments) -> Result<()> {
+    let common = &arguments.common;
+    let source = PolicySource::load(&common.policy)?;
+    let PolicySource::Image(image) = &source else {
+        bail!(
+            "{} is no policy image: sil runs what is flashed, so freeze the run first with `snakectl export`",
+            common.policy
+        );
+    };
+    let config = Arc::new(source.environment(common.robot()?.as_ref())?);
+    let record = if arguments.replay.is_some() { REPLAYED } else { 0 };
+    let trial = BusTrial { config: config.clone(), image, common, bus: &arguments.bus, record };
+    let mut captured = Vec::new();
+    let capture: Option<&mut dyn Write> = if arguments.capture.is_some() { Some(&mut captured) } else { None };
+    let bar = common.bar();
+    let (report, recorded) = trial.run(capture, &|| bar.inc(1))?;
+    bar.finish_and_clear();
+    if let Some(path) = &arguments.capture {
+        write_whole(path, &captured)?;
+    }
+    if let Some(path) = &arguments.replay {
+        write_replay(&config, recorded, &common.policy, path)?;
+    }
+    if common.json {
+        println!("{}", serde_json::to_string(&report)?);
+        return Ok(());
+    }
+    print!("{}{}", table(&report.task), bus_table(&report));
+    for path in arguments.capture.iter().chain(&arguments.replay) {
+        println!("  written: {}", path.display());
+    }
+    Ok(())
+}
+
+/// The lines about the bus.
+pub fn bus_table(report: &BusReport) -> String {
+    format!(
+        "  bus {}: load {:.1} %, oldest latent {:.1} ms, {} deadline misses, {} error frames, {:.0} times real time\n",
+        report.bus,
+        100.0 * report.bus_load,
+        report.latent_age_max_ms,
+        report.deadline_misses,
+        report.error_frames,
+        report.realtime_factor
+    )
+}
+
+/// Writes recorded episodes as one page.
+pub fn write_replay(
+    config: &EnvConfig,
+    episodes: Vec<crate::replay::Episode>,
+    policy: &str,
+    path: &std::path::Path,
+) -> Result<()> {
+    let mut recording = crate::recorder::recording(config, policy);
+    for episode in episodes {
+        recording.push(episode);
+    }
+    recording.write_html(path).with_context(|| format!("no replay in {}", path.display()))
+}
