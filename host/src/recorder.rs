@@ -31,18 +31,12 @@ pub struct Recorder {
     episode: Episode,
     faults: Vec<ScheduledFault>,
     time_keeper: Option<u8>,
-    torque_limit: f32,
 }
 
 impl Recorder {
     /// Begins with the plant as it is.
     pub fn new(name: &str, plant: &SnakePlant, faults: &[ScheduledFault]) -> Self {
-        let mut recorder = Recorder {
-            episode: Episode::new(name),
-            faults: faults.to_vec(),
-            time_keeper: None,
-            torque_limit: plant.snake().robot().torque_limit,
-        };
+        let mut recorder = Recorder { episode: Episode::new(name), faults: faults.to_vec(), time_keeper: None };
         for scheduled in faults {
             recorder.episode.event((scheduled.at_ns as f64 * 1e-9) as f32, describe(&scheduled.fault));
             if let Some(until) = scheduled.until_ns {
@@ -61,7 +55,7 @@ impl Recorder {
             time,
             links,
             status,
-            torques: (0..modules).map(|m| plant.snake().torque(m).map(|t| t / self.torque_limit)).collect(),
+            torques: (0..modules).map(|m| plant.snake().torque(m)).collect(),
             goal: Some(plant.goal_in_world()),
             distance: plant.distance(),
             attention,

@@ -265,11 +265,13 @@ impl Node {
     }
 
     /// Its most urgent frame and the order of its mail; none for the babbled one.
-    fn candidate(&self, now: u64) -> Option<(Frame, Option<u64>)> {
+    fn candidate(&self, now: u64) -> Option<(&Frame, Option<u64>)> {
         let ready = self.mailboxes.iter().filter(|mail| mail.ready_ns <= now);
         let best = ready.min_by_key(|mail| (mail.frame.id, mail.order));
-        match (best, self.babble.map(|(frame, _)| frame)) {
-            (Some(mail), babble) if babble.is_none_or(|b| mail.frame.id < b.id) => Some((mail.frame, Some(mail.order))),
+        match (best, self.babble.as_ref().map(|(frame, _)| frame)) {
+            (Some(mail), babble) if babble.is_none_or(|b| mail.frame.id < b.id) => {
+                Some((&mail.frame, Some(mail.order)))
+            }
             (_, babble) => babble.map(|frame| (frame, None)),
         }
     }
@@ -753,7 +755,7 @@ impl Bus {
 
     fn arbitrate(&mut self, index: usize, sof: u64, now: u64) {
         let members = self.segments[index].members & self.attached & !self.off;
-        let (mut transmitters, mut frame, mut same) = (0, None::<Frame>, true);
+        let (mut transmitters, mut frame, mut same) = (0, None::<&Frame>, true);
         for node in nodes(members & self.pending) {
             let slot = &self.nodes[node];
             if slot.held_ns > sof || slot.joins_ns > sof {
@@ -769,7 +771,7 @@ impl Bus {
                 _ => (transmitters, frame, same) = (bit(node), Some(mine), true),
             }
         }
-        let Some(mut frame) = frame else {
+        let Some(mut frame) = frame.copied() else {
             // Whoever took the bus is gone.
             self.segments[index].phase = Phase::Idle { since: now, counted: now };
             self.schedule(index);
@@ -857,7 +859,7 @@ impl Bus {
     /// Several nodes passed arbitration with the same identifier and different frames.
     fn collide(&self, transmitters: Nodes, now: u64) -> Collision {
         let mut streams: Vec<(usize, Frame, BitStream)> = nodes(transmitters)
-            .filter_map(|node| self.nodes[node].candidate(now).map(|(frame, _)| (node, frame, BitStream::new(&frame))))
+            .filter_map(|node| self.nodes[node].candidate(now).map(|(frame, _)| (node, *frame, BitStream::new(frame))))
             .collect();
         let mut losers = 0;
         let mut at = 0;

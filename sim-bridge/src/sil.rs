@@ -1254,4 +1254,44 @@ mod tests {
         let (report, _) = simulate(&mut Toy::new(2, 100_000), &config);
         assert!(report.cut_short && report.duration_ns == 1000 * MS);
     }
+
+    proptest::proptest! {
+        #![proptest_config(proptest::prelude::ProptestConfig::with_cases(24))]
+
+        /// Whatever goes wrong together: the run ends, with nothing but numbers for torques within the limit, and can be repeated.
+        #[test]
+        fn any_mixture_of_faults_is_survived(
+            kinds in proptest::collection::vec((0usize..11, 0usize..6, 1u32..1500, 1u32..1500), 0..6), classic: bool, seed: u64,
+        ) {
+            let texts: Vec<String> = kinds.iter().map(|&(kind, module, from, length)| {
+                let p = f64::from(from % 100) / 100.0;
+                let what = match kind {
+                    0 => format!("unplug:#{module}"),
+                    1 => format!("action:#{module}"),
+                    2 => format!("observation:#{module}"),
+                    3 => format!("stuck:#{module}"),
+                    4 => format!("babble:#{module}/{}", from % 0x800),
+                    5 => format!("cut:{module}"),
+                    6 => format!("drop:{p}"),
+                    7 => format!("delay:{}us", from * 10),
+                    8 => format!("corrupt:{p}"),
+                    9 => format!("corrupt:{p}#{module}"),
+                    _ => format!("duplicate:{p}"),
+                };
+                format!("{what}@{from}ms..{}ms", from + length)
+            }).collect();
+            let plan: FaultPlan = texts.join(",").parse().unwrap();
+            let bus = if classic { BusKind::Classic } else { BusKind::Fd };
+            let config = SilConfig { faults: plan.draw(seed, 6), seed, station_behind: (seed % 8) as usize, ..SilConfig::new(bus) };
+            let go = || {
+                let mut toy = Toy::new(6, 80);
+                let report = run(&mut toy, &image(), &config, None, &mut |_, _| {}).unwrap();
+                (report, toy.history)
+            };
+            let (report, history) = go();
+            proptest::prop_assert!(!report.cut_short && report.duration_ns == 4_000 * MS);
+            proptest::prop_assert!(history.iter().flatten().flatten().all(|t| t.abs() <= 80.0));
+            proptest::prop_assert!((report, history) == go());
+        }
+    }
 }

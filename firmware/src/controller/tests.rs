@@ -966,3 +966,68 @@ proptest! {
         }
     }
 }
+
+#[derive(Clone, Copy, Debug)]
+enum Event {
+    Unplug(usize),
+    Plug(usize),
+    Cut(usize),
+    Mend,
+    Loss(u32),
+    Wait(Micros),
+}
+
+fn any_event() -> impl Strategy<Value = Event> {
+    prop_oneof![
+        (0usize..6).prop_map(Event::Unplug),
+        (0usize..6).prop_map(Event::Plug),
+        (1usize..6).prop_map(Event::Cut),
+        Just(Event::Mend),
+        (0u32..60).prop_map(Event::Loss),
+        (0u64..400_000).prop_map(Event::Wait),
+        (0u64..400_000).prop_map(Event::Wait),
+        (0u64..400_000).prop_map(Event::Wait),
+    ]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 48, failure_persistence: None, ..ProptestConfig::default() })]
+
+    /// Whatever happened to cable, frames and modules: once all is well again the robot is one again, within a second and a half.
+    #[test]
+    fn the_robot_heals(events in prop::collection::vec(any_event(), 1..25), seed in any::<u32>()) {
+        let mut net = Net::new(6, BusKind::Fd, policy(1, &[]));
+        for event in events {
+            match event {
+                Event::Unplug(node) => net.unplug(node),
+                Event::Plug(node) if net.nodes[node].is_none() => net.plug(node as u8),
+                Event::Plug(_) => {}
+                Event::Cut(at) => net.part = (0..6).map(|i| u8::from(i >= at)).collect(),
+                Event::Mend => net.part = vec![0; 6],
+                Event::Loss(percent) => {
+                    let mut state = seed;
+                    net.loss = Box::new(move |_, _, _| {
+                        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                        (state >> 16) % 100 < percent
+                    });
+                }
+                Event::Wait(time) => net.run(time),
+            }
+        }
+        net.part = vec![0; 6];
+        net.loss = Box::new(|_, _, _| false);
+        for node in 0..6 {
+            if net.nodes[usize::from(node)].is_none() {
+                net.plug(node);
+            }
+        }
+        net.run(3 * SECOND / 2);
+        net.assert_in_step();
+        prop_assert_eq!(net.time_keeper(), Some(0));
+        let misses: Vec<_> = net.live().map(|n| n.stats().deadline_misses).collect();
+        net.run(SECOND / 2);
+        prop_assert!(net.live().all(|n| n.heard() == 0x3f));
+        prop_assert!(net.live().zip(misses).all(|(n, before)| n.stats().deadline_misses == before));
+        prop_assert!(net.outputs.iter().all(|o| o.motors_enabled));
+    }
+}

@@ -1,5 +1,6 @@
 //! The command line. Every verb is a thin layer over the library.
 
+mod bench;
 mod dbc;
 mod demo;
 mod eval;
@@ -35,6 +36,8 @@ enum Verb {
     Export(export::Arguments),
     /// Run complete controllers with a frozen policy on a simulated CAN bus.
     Sil(sil::Arguments),
+    /// Measure the speed of physics, training and bus on this machine.
+    Bench(bench::Arguments),
     /// Print the bus's message database in DBC form.
     Dbc(dbc::Arguments),
 }
@@ -47,6 +50,7 @@ pub fn main() -> ExitCode {
         Some(Verb::Eval(arguments)) => eval::run(&arguments),
         Some(Verb::Export(arguments)) => export::run(&arguments),
         Some(Verb::Sil(arguments)) => sil::run(&arguments),
+        Some(Verb::Bench(arguments)) => bench::run(&arguments),
         Some(Verb::Dbc(arguments)) => dbc::run(&arguments),
         None => demo::run(&arguments.demonstration),
     };

@@ -1,0 +1,111 @@
+//! `snakectl bench`: speed of physics, training and bus on this machine, side by side in one run.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use anyhow::Result;
+use composer_sim_bridge::sil::{self, SilConfig};
+
+use super::PolicySource;
+use crate::env::{EnvConfig, SnakeEnv};
+use crate::environment::{Environment, View};
+use crate::eval::{Pilot, episode_seed, parallel};
+use crate::robot::Robot;
+use crate::run::RunConfig;
+use crate::sil::SnakePlant;
+use crate::train::Trainer;
+use crate::train::progress::Times;
+
+/// Lengths at which cost is measured.
+const LENGTHS: [usize; 4] = [8, 16, 32, 64];
+
+/// Arguments of `bench`.
+#[derive(clap::Args, Clone, Debug)]
+pub struct Arguments {
+    /// Seconds for each figure
+    #[arg(long, default_value_t = 5.0)]
+    seconds: f64,
+}
+
+/// Control steps per second over all threads.
+fn physics(robot: &Robot, threads: usize, seconds: f64) -> f64 {
+    let config = Arc::new(EnvConfig::new(robot.clone()));
+    let rates = parallel(threads, threads, |thread| {
+        let mut env = SnakeEnv::new(config.clone());
+        let (mut view, mut actions) = (View::default(), Vec::new());
+        let (start, mut steps, mut seed) = (Instant::now(), 0u64, thread as u64);
+        while start.elapsed().as_secs_f64() < seconds {
+            env.view(&mut view);
+            Pilot::Random.act(&view, seed ^ steps, &mut actions, None);
+            let outcome = env.step(&actions);
+            steps += 1;
+            if outcome.terminated || outcome.truncated {
+                seed += threads as u64;
+                env.reset(seed);
+            }
+        }
+        steps as f64 / start.elapsed().as_secs_f64()
+    });
+    rates.iter().sum()
+}
+
+/// Time spent in training iterations after the first, which warms up.
+fn training(config: &RunConfig, seconds: f64) -> Result<Times> {
+    let make =
+        |index: usize| -> Result<Box<dyn Environment>> { Ok(Box::new(SnakeEnv::new(config.environment(index)?))) };
+    let mut trainer = Trainer::new(&config.train, &make, "benchmark")?;
+    trainer.iterate()?;
+    let (start, mut times) = (Instant::now(), Times::default());
+    while start.elapsed().as_secs_f64() < seconds || times.steps == 0 {
+        times.add(&trainer.iterate()?.times);
+    }
+    Ok(times)
+}
+
+/// Virtual time by wall time of one thread, whole episodes on the bus.
+fn bus(image: &[u8], robot: &Robot, seconds: f64) -> Result<(f64, f64)> {
+    let config = Arc::new(EnvConfig::new(robot.clone()));
+    let (start, mut virtual_ns, mut load, mut episodes) = (Instant::now(), 0u64, 0.0, 0u64);
+    while start.elapsed().as_secs_f64() < seconds {
+        let mut plant = SnakePlant::new(config.clone(), episode_seed(1, episodes));
+        let sil = SilConfig::new(composer_firmware::controller::BusKind::Fd);
+        let report = sil::run(&mut plant, image, &sil, None, &mut |_, _| {})?;
+        virtual_ns += report.duration_ns;
+        load += report.bus_load;
+        episodes += 1;
+    }
+    Ok((virtual_ns as f64 * 1e-9 / start.elapsed().as_secs_f64(), load / episodes.max(1) as f64))
+}
+
+/// Runs the verb.
+pub fn run(arguments: &Arguments) -> Result<()> {
+    let seconds = arguments.seconds;
+    let cores = super::cores();
+    let robot = Robot::default();
+    println!("physics alone, control steps/s (0.05 s, {} physics steps each), random torques", 5);
+    println!("{:>8} {:>12} {:>12}", "modules", "one thread", "all threads");
+    for modules in LENGTHS {
+        let robot = robot.with_modules(modules)?;
+        println!("{modules:>8} {:>12.0} {:>12.0}", physics(&robot, 1, seconds), physics(&robot, cores, seconds));
+    }
+    let config = RunConfig::default();
+    let times = training(&config, 3.0 * seconds)?;
+    let [physics, inference, update] = times.shares();
+    println!(
+        "\ntraining, 8 modules, {} threads: {:.0} environment steps/s; physics {:.0} %, inference {:.0} %, update {:.0} % of the time",
+        cores,
+        times.steps_per_second(),
+        100.0 * physics,
+        100.0 * inference,
+        100.0 * update
+    );
+    if let Ok(PolicySource::Image(image)) = PolicySource::load("goal-reaching") {
+        println!("\ncontrollers on the CAN-FD bus (1M/5M) with physics, one thread");
+        println!("{:>8} {:>16} {:>10}", "modules", "times real time", "bus load");
+        for modules in LENGTHS {
+            let (factor, load) = bus(&image, &robot.with_modules(modules)?, seconds)?;
+            println!("{modules:>8} {factor:>16.1} {:>8.1} %", 100.0 * load);
+        }
+    }
+    Ok(())
+}
