@@ -356,13 +356,14 @@ impl Environment for SnakeEnv {
             self.snake.step();
         }
         self.steps += 1;
-        if self.snake.height() < 4.0 * self.config.robot.link_radius {
+        let (height, radius) = (self.snake.height(), self.config.robot.link_radius);
+        if height < 4.0 * radius {
             self.low_steps += 1;
         }
         let before = self.distance;
         self.distance = self.measure();
         let success = self.distance < self.config.task.success_distance;
-        let reward = self.config.task.reward(before, self.distance, success);
+        let reward = self.config.task.reward(before, self.distance, success, height - 3.0 * radius);
         self.episode_return += reward;
         self.sample();
         Outcome {

@@ -116,7 +116,7 @@ pub fn observe(sensors: &Sensors, place: f32, head: &Pose, goal: Option<Vector3<
         let to_goal = head.point(goal);
         // The distance counts from the head, the direction from here.
         let distance = libm::sqrtf(goal.dot(&goal));
-        let from_here = libm::sqrtf(to_goal.dot(&goal)).max(1e-3);
+        let from_here = libm::sqrtf(to_goal.dot(&to_goal)).max(1e-3);
         for axis in 0..3 {
             o[axis] = (to_goal[axis] / 10.0).clamp(-2.0, 2.0);
             o[3 + axis] = to_goal[axis] / from_here;
@@ -160,6 +160,8 @@ mod tests {
         let o = observe(&level(), place(1, 8), &chain.head_seen_from(1), Some(Vector3::new(0.0, 5.0, 0.0)));
         // Module 1's second link is 2.5 units behind the head.
         assert!((o[0] - 0.25).abs() < 1e-6 && (o[1] - 0.5).abs() < 1e-6);
+        let direction: f32 = o[3..6].iter().map(|v| v * v).sum();
+        assert!((direction - 1.0).abs() < 1e-5 && (o[4] / o[3] - 2.0).abs() < 1e-5, "{o:?}");
         assert!((o[6] - libm::logf(6.0)).abs() < 1e-6);
         assert_eq!(o[7], 1.0);
         assert!((o[27] - 1.0 / 7.0).abs() < 1e-6);

@@ -8,6 +8,7 @@ use burn::tensor::activation::softmax;
 use burn::tensor::{Device, Tensor, TensorData};
 use composer_shared::observation::SIZE;
 
+use super::fused::bias_tanh;
 use super::{Block, Method, Stream, lay_out, orthogonal, stream};
 use crate::environment::PRIVILEGED;
 use crate::network::{Dense, Network};
@@ -57,32 +58,19 @@ impl ActorLayout {
     /// The layout for a method.
     pub fn new(method: Method) -> Self {
         let attention = usize::from(method.attention());
-        let (
-            [encoder, encoder_bias, attention, hidden, hidden_context, hidden_bias, output, output_bias, log_sigma],
-            len,
-        ) = lay_out([
-            ("encoder.weight", EMBED, SIZE),
-            ("encoder.bias", 1, EMBED),
-            ("attention.weight", attention * (2 * KEY + VALUE), EMBED),
-            ("hidden.weight", HIDDEN, EMBED),
-            ("hidden.context_weight", HIDDEN, attention * VALUE),
-            ("hidden.bias", 1, HIDDEN),
-            ("output.weight", OUT, HIDDEN),
-            ("output.bias", 1, OUT),
-            ("log_sigma", 1, OUT),
-        ]);
-        Self {
-            encoder,
-            encoder_bias,
-            attention,
-            hidden,
-            hidden_context,
-            hidden_bias,
-            output,
-            output_bias,
-            log_sigma,
-            len,
-        }
+        let ([encoder, encoder_bias, attention, hidden, hidden_context, hidden_bias, output, output_bias, log_sigma], len) =
+            lay_out([
+                ("encoder.weight", EMBED, SIZE),
+                ("encoder.bias", 1, EMBED),
+                ("attention.weight", attention * (2 * KEY + VALUE), EMBED),
+                ("hidden.weight", HIDDEN, EMBED),
+                ("hidden.context_weight", HIDDEN, attention * VALUE),
+                ("hidden.bias", 1, HIDDEN),
+                ("output.weight", OUT, HIDDEN),
+                ("output.bias", 1, OUT),
+                ("log_sigma", 1, OUT),
+            ]);
+        Self { encoder, encoder_bias, attention, hidden, hidden_context, hidden_bias, output, output_bias, log_sigma, len }
     }
 
     /// All blocks in order.
@@ -126,8 +114,7 @@ impl ActorLayout {
 
     /// The network that these parameters are, with the statistics of its observations.
     pub fn network(&self, parameters: &[f32], mean: [f32; SIZE], std: [f32; SIZE]) -> Network {
-        let dense =
-            |weights: Vec<f32>, inputs: usize, outputs: usize, bias: Vec<f32>| Dense { inputs, outputs, weights, bias };
+        let dense = |weights: Vec<f32>, inputs: usize, outputs: usize, bias: Vec<f32>| Dense { inputs, outputs, weights, bias };
         let part = |block: Block| parameters[block.range()].to_vec();
         let attention = !self.attention.is_empty();
         let qkv = if attention { part(self.attention) } else { vec![0.0; (2 * KEY + VALUE) * EMBED] };
@@ -337,8 +324,8 @@ impl ActorLayout {
         let (samples, modules) = (batch.samples, batch.modules);
         let rows = samples * modules;
         let x = Tensor::<2>::from_data(TensorData::new(batch.observations.clone(), [rows, SIZE]), device);
-        let e = (x.matmul(encoder.transpose()) + encoder_bias).tanh();
-        let mut h = e.clone().matmul(hidden.transpose()) + hidden_bias;
+        let e = bias_tanh(x.matmul(encoder.transpose()), encoder_bias);
+        let mut h = e.clone().matmul(hidden.transpose());
         if let (Some(attention), Some(hidden_context)) = (attention.clone(), hidden_context.clone()) {
             let qkv = e.matmul(attention.transpose()).reshape([samples, modules, 2 * KEY + VALUE]);
             let q = qkv.clone().slice([0..samples, 0..modules, 0..KEY]);
@@ -357,7 +344,7 @@ impl ActorLayout {
             let context = softmax(scores, 2).matmul(v).reshape([rows, VALUE]);
             h = h + context.matmul(hidden_context.transpose());
         }
-        h.tanh().matmul(output.transpose()) + output_bias
+        bias_tanh(h, hidden_bias).matmul(output.transpose()) + output_bias
     }
 
     /// Means of the actions of a batch, without gradients: what training believes the policy says.
@@ -372,8 +359,9 @@ impl ActorLayout {
         let rows = batch.samples * batch.modules;
         let tensors = tensors(parameters, self.blocks(), &device);
         let mean = self.forward(&tensors, batch, &device);
-        let column =
-            |data: Vec<f32>, columns: usize| Tensor::<2>::from_data(TensorData::new(data, [rows, columns]), &device);
+        let column = |data: Vec<f32>, columns: usize| {
+            Tensor::<2>::from_data(TensorData::new(data, [rows, columns]), &device)
+        };
         let Some(log_sigma) = tensors[8].clone() else { unreachable!("log sigma is never empty") };
         let actions = column(batch.actions.clone(), OUT);
         let advantages = batch.advantages.iter().flat_map(|a| std::iter::repeat_n(*a, batch.modules)).collect();
@@ -382,7 +370,8 @@ impl ActorLayout {
         // Constants of the density cancel in the ratio, but log sigma does not: it is being learnt.
         let offset = batch.log_probabilities.iter().map(|l| l + LOG_DENSITY_CONSTANT).collect();
         let distance = (actions - mean) * log_sigma.clone().neg().exp();
-        let log_ratio = (distance.clone() * distance).sum_dim(1) * -0.5 - log_sigma.sum_dim(1) - column(offset, 1);
+        let log_ratio =
+            (distance.clone() * distance).sum_dim(1) * -0.5 - log_sigma.sum_dim(1) - column(offset, 1);
         let ratio = log_ratio.clone().exp();
         let gain = ratio.clone() * advantages.clone();
         let clipped = ratio.clone().clamp(1.0 - loss.clip, 1.0 + loss.clip) * advantages;
@@ -418,24 +407,16 @@ pub fn log_probability(action: [f32; OUT], mean: [f32; OUT], log_sigma: [f32; OU
 impl CriticLayout {
     /// Values of a batch on the critic's scale, `[samples, 1]`.
     fn forward(&self, p: &[Option<Tensor<2>>; 8], batch: &Batch, device: &Device) -> Tensor<2> {
-        let [
-            Some(first),
-            Some(first_bias),
-            Some(second),
-            Some(second_bias),
-            Some(team),
-            Some(team_bias),
-            Some(value),
-            Some(value_bias),
-        ] = p.each_ref().map(|tensor| tensor.clone())
+        let [Some(first), Some(first_bias), Some(second), Some(second_bias), Some(team), Some(team_bias), Some(value), Some(value_bias)] =
+            p.each_ref().map(|tensor| tensor.clone())
         else {
             unreachable!("no block of the critic is empty");
         };
         let (samples, modules) = (batch.samples, batch.modules);
         let rows = samples * modules;
         let x = Tensor::<2>::from_data(TensorData::new(batch.critic_inputs.clone(), [rows, CRITIC_INPUT]), device);
-        let h = (x.matmul(first.transpose()) + first_bias).tanh();
-        let h = (h.matmul(second.transpose()) + second_bias).tanh().reshape([samples, modules, EMBED]);
+        let h = bias_tanh(x.matmul(first.transpose()), first_bias);
+        let h = bias_tanh(h.matmul(second.transpose()), second_bias).reshape([samples, modules, EMBED]);
         // Row 0 takes the mean over the modules that are there, row 1 the head.
         let mut pool = vec![0.0f32; 2 * rows];
         for (pool, present) in pool.chunks_exact_mut(2 * modules).zip(&batch.present) {
@@ -444,7 +425,7 @@ impl CriticLayout {
         }
         let pool = Tensor::<3>::from_data(TensorData::new(pool, [samples, 2, modules]), device);
         let pooled = pool.matmul(h).reshape([samples, 2 * EMBED]);
-        let h = (pooled.matmul(team.transpose()) + team_bias).tanh();
+        let h = bias_tanh(pooled.matmul(team.transpose()), team_bias);
         h.matmul(value.transpose()) + value_bias
     }
 
@@ -458,7 +439,8 @@ impl CriticLayout {
     pub fn gradient(&self, parameters: &[f32], batch: &Batch, weight: f32) -> Gradient {
         let device = Device::flex().autodiff();
         let tensors = tensors(parameters, self.blocks(), &device);
-        let targets = Tensor::<2>::from_data(TensorData::new(batch.targets.clone(), [batch.samples, 1]), &device);
+        let targets =
+            Tensor::<2>::from_data(TensorData::new(batch.targets.clone(), [batch.samples, 1]), &device);
         let error = self.forward(&tensors, batch, &device) - targets;
         let loss = (error.clone() * error).sum() * (0.5 * weight);
         let gradient = collect(&loss, tensors, self.blocks(), self.len);

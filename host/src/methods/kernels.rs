@@ -102,6 +102,60 @@ fn tanh_fma(x: &mut [f32]) {
     x.iter_mut().for_each(|x| *x = tanh_body(*x, |a, b, c| a.mul_add(b, c)));
 }
 
+/// Adds `bias` to every row of `x` and replaces it by its hyperbolic tangent.
+pub fn bias_tanh(x: &mut [f32], bias: &[f32]) {
+    #[cfg(target_arch = "x86_64")]
+    if fast() {
+        // SAFETY: the processor has AVX2 and FMA.
+        unsafe { bias_tanh_fma(x, bias) };
+        return;
+    }
+    bias_tanh_body(x, bias, |a, b, c| a * b + c);
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma")]
+fn bias_tanh_fma(x: &mut [f32], bias: &[f32]) {
+    bias_tanh_body(x, bias, |a, b, c| a.mul_add(b, c));
+}
+
+#[inline(always)]
+fn bias_tanh_body(x: &mut [f32], bias: &[f32], fma: impl Fn(f32, f32, f32) -> f32 + Copy) {
+    for row in x.chunks_exact_mut(bias.len()) {
+        for (x, bias) in row.iter_mut().zip(bias) {
+            *x = tanh_body(*x + bias, fma);
+        }
+    }
+}
+
+/// The way back of [`bias_tanh`]: turns the gradient of its output `y` into that of its input, and adds its rows up in `of_bias`.
+pub fn bias_tanh_backward(gradient: &mut [f32], y: &[f32], of_bias: &mut [f32]) {
+    #[cfg(target_arch = "x86_64")]
+    if fast() {
+        // SAFETY: the processor has AVX2 and FMA.
+        unsafe { bias_tanh_backward_fma(gradient, y, of_bias) };
+        return;
+    }
+    bias_tanh_backward_body(gradient, y, of_bias);
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma")]
+fn bias_tanh_backward_fma(gradient: &mut [f32], y: &[f32], of_bias: &mut [f32]) {
+    bias_tanh_backward_body(gradient, y, of_bias);
+}
+
+#[inline(always)]
+fn bias_tanh_backward_body(gradient: &mut [f32], y: &[f32], of_bias: &mut [f32]) {
+    let columns = of_bias.len();
+    for (gradient, y) in gradient.chunks_exact_mut(columns).zip(y.chunks_exact(columns)) {
+        for ((g, y), b) in gradient.iter_mut().zip(y).zip(of_bias.iter_mut()) {
+            *g *= 1.0 - y * y;
+            *b += *g;
+        }
+    }
+}
+
 /// The rational approximation of degree 13 over 6 that Eigen and XLA use.
 #[inline(always)]
 #[allow(clippy::excessive_precision)]

@@ -6,6 +6,7 @@
 //! | goal | a point at rest height, `goal_distance` units from the head in any direction |
 //! | reward `paper` | `-0.1 d(head, goal)` a step (the paper's `-d`; the learner's value normalisation makes the factor immaterial) |
 //! | reward `progress` | decrease of `d(head, goal)` in units, and 2 on success: the same optimum by potential shaping, denser |
+//! | `rearing_penalty` | taken off for rearing up; 0 unless set |
 //! | success | `d(head, goal) < 2` units (the paper's `d_g`); ends the episode |
 //! | cap | 125 control steps of 0.05 s; the value of the last state is bootstrapped |
 //!
@@ -40,6 +41,9 @@ pub struct GoalReaching {
     pub cap: u32,
     /// Reward of the training.
     pub reward: Reward,
+    /// Taken off the reward of a step for each unit that the highest link is above one and a half link diameters. The paper has
+    /// no such term; without it the fastest policies rear up and throw themselves at the goal.
+    pub rearing_penalty: f32,
 }
 
 impl Default for GoalReaching {
@@ -50,6 +54,7 @@ impl Default for GoalReaching {
             success_distance: 2.0,
             cap: 125,
             reward: Reward::Paper,
+            rearing_penalty: 0.0,
         }
     }
 }
@@ -70,6 +75,9 @@ impl GoalReaching {
         if self.success_distance.is_nan() || self.success_distance <= 0.0 {
             return Err(format!("success_distance = {}; it must be above zero", self.success_distance));
         }
+        if !(self.rearing_penalty >= 0.0 && self.rearing_penalty.is_finite()) {
+            return Err(format!("rearing_penalty = {}; it must be zero or more", self.rearing_penalty));
+        }
         if self.cap == 0 {
             return Err("cap = 0; an episode needs at least one step".into());
         }
@@ -86,12 +94,14 @@ impl GoalReaching {
         [distance * cos, distance * sin, height]
     }
 
-    /// The reward for coming from distance `before` to `after`.
-    pub fn reward(&self, before: f32, after: f32, success: bool) -> f32 {
-        match self.reward {
+    /// The reward for coming from distance `before` to `after`, with the highest link `too_high` units above one and a half
+    /// link diameters.
+    pub fn reward(&self, before: f32, after: f32, success: bool, too_high: f32) -> f32 {
+        let task = match self.reward {
             Reward::Paper => -0.1 * after,
             Reward::Progress => before - after + if success { 2.0 } else { 0.0 },
-        }
+        };
+        task - self.rearing_penalty * too_high.max(0.0)
     }
 }
 
