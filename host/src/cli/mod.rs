@@ -6,6 +6,7 @@ mod demo;
 mod eval;
 mod export;
 mod policy_file;
+mod report;
 mod sil;
 mod train;
 
@@ -36,6 +37,8 @@ enum Verb {
     Export(export::Arguments),
     /// Run complete controllers with a frozen policy on a simulated CAN bus.
     Sil(sil::Arguments),
+    /// Make a published comparison from nothing: figure, table, data.
+    Report(report::Arguments),
     /// Measure the speed of physics, training and bus on this machine.
     Bench(bench::Arguments),
     /// Print the bus's message database in DBC form.
@@ -50,6 +53,7 @@ pub fn main() -> ExitCode {
         Some(Verb::Eval(arguments)) => eval::run(&arguments),
         Some(Verb::Export(arguments)) => export::run(&arguments),
         Some(Verb::Sil(arguments)) => sil::run(&arguments),
+        Some(Verb::Report(arguments)) => report::run(&arguments),
         Some(Verb::Bench(arguments)) => bench::run(&arguments),
         Some(Verb::Dbc(arguments)) => dbc::run(&arguments),
         None => demo::run(&arguments.demonstration),

@@ -15,7 +15,7 @@ use crate::methods::Method;
 use crate::network::Network;
 use crate::robot::Robot;
 use crate::run::RunConfig;
-use crate::train::train;
+use crate::train::{TrainSummary, train};
 
 /// Seed of the evaluations during training; `snakectl eval` uses others by default.
 const EVALUATION_SEED: u64 = 0x7a1e;
@@ -86,39 +86,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
     config.validate()?;
     let name = format!("{}-{}-{}", arguments.task, config.train.method, config.train.seed);
     let out = arguments.resume.or(arguments.out).unwrap_or_else(|| Path::new("runs").join(name));
-    create_folder(&out)?;
-    if !resuming {
-        if out.join(CONFIG_FILE).exists() {
-            bail!("{} already holds a run: go on with --resume {0}, or choose another --out", out.display());
-        }
-        write_whole(&out.join(CONFIG_FILE), toml::to_string(&config)?.as_bytes())?;
-    }
-
-    let evaluation = Arc::new(config.evaluation());
-    let faulty = |seed, modules| config.faults.draw(seed, modules);
-    let mut judge = |network: &Network, _steps: u64| {
-        let trial = Trial {
-            config: &evaluation,
-            episodes: arguments.evaluation_episodes as usize,
-            seed: EVALUATION_SEED,
-            faults: &healthy,
-            threads: super::cores(),
-        };
-        let report = trial.evaluate(Pilot::Float(network), "none", &|| {});
-        let mut scalars = scalars(&report, "evaluation");
-        if config.faults.probability > 0.0 {
-            let report = Trial { faults: &faulty, ..trial }.evaluate(Pilot::Float(network), "as trained", &|| {});
-            scalars.extend(self::scalars(&report, "evaluation_faults"));
-        }
-        // A run that is killed keeps the policy of its last evaluation; a failure to write shows at the checkpoint.
-        let _ = save_network(&out, network);
-        scalars
-    };
-    let make = |index: usize| -> Result<Box<dyn crate::environment::Environment>> {
-        Ok(Box::new(SnakeEnv::new(config.environment(index)?)))
-    };
-    let summary = train(&config.train, &make, &fingerprint(&config), &out, resuming, &mut judge)?;
-    save_network(&out, &summary.network)?;
+    let summary = train_in(&config, &out, resuming, arguments.evaluation_episodes as usize)?;
     println!(
         "{} after {} steps, {:.0} s in this session: {}",
         if summary.interrupted { "stopped" } else { "done" },
@@ -130,6 +98,44 @@ pub fn run(arguments: Arguments) -> Result<()> {
         println!("  {name} {value:.3}");
     }
     Ok(())
+}
+
+/// Starts a run in the folder `out`, or goes on with the one that is there. Judges the policy every so often, healthy and (if it trains with
+/// faults) faulty, and keeps the network of the last judgement.
+pub fn train_in(config: &RunConfig, out: &Path, resuming: bool, evaluation_episodes: usize) -> Result<TrainSummary> {
+    create_folder(out)?;
+    if !resuming {
+        if out.join(CONFIG_FILE).exists() {
+            bail!("{} already holds a run: go on with --resume {0}, or choose another --out", out.display());
+        }
+        write_whole(&out.join(CONFIG_FILE), toml::to_string(config)?.as_bytes())?;
+    }
+    let evaluation = Arc::new(config.evaluation());
+    let faulty = |seed, modules| config.faults.draw(seed, modules);
+    let mut judge = |network: &Network, _steps: u64| {
+        let trial = Trial {
+            config: &evaluation,
+            episodes: evaluation_episodes,
+            seed: EVALUATION_SEED,
+            faults: &healthy,
+            threads: super::cores(),
+        };
+        let report = trial.evaluate(Pilot::Float(network), "none", &|| {});
+        let mut scalars = scalars(&report, "evaluation");
+        if config.faults.probability > 0.0 {
+            let report = Trial { faults: &faulty, ..trial }.evaluate(Pilot::Float(network), "as trained", &|| {});
+            scalars.extend(self::scalars(&report, "evaluation_faults"));
+        }
+        // A run that is killed keeps the policy of its last evaluation; a failure to write shows at the checkpoint.
+        let _ = save_network(out, network);
+        scalars
+    };
+    let make = |index: usize| -> Result<Box<dyn crate::environment::Environment>> {
+        Ok(Box::new(SnakeEnv::new(config.environment(index)?)))
+    };
+    let summary = train(&config.train, &make, &fingerprint(config), out, resuming, &mut judge)?;
+    save_network(out, &summary.network)?;
+    Ok(summary)
 }
 
 /// What goes into the metrics from an evaluation.

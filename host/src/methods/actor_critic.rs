@@ -58,19 +58,32 @@ impl ActorLayout {
     /// The layout for a method.
     pub fn new(method: Method) -> Self {
         let attention = usize::from(method.attention());
-        let ([encoder, encoder_bias, attention, hidden, hidden_context, hidden_bias, output, output_bias, log_sigma], len) =
-            lay_out([
-                ("encoder.weight", EMBED, SIZE),
-                ("encoder.bias", 1, EMBED),
-                ("attention.weight", attention * (2 * KEY + VALUE), EMBED),
-                ("hidden.weight", HIDDEN, EMBED),
-                ("hidden.context_weight", HIDDEN, attention * VALUE),
-                ("hidden.bias", 1, HIDDEN),
-                ("output.weight", OUT, HIDDEN),
-                ("output.bias", 1, OUT),
-                ("log_sigma", 1, OUT),
-            ]);
-        Self { encoder, encoder_bias, attention, hidden, hidden_context, hidden_bias, output, output_bias, log_sigma, len }
+        let (
+            [encoder, encoder_bias, attention, hidden, hidden_context, hidden_bias, output, output_bias, log_sigma],
+            len,
+        ) = lay_out([
+            ("encoder.weight", EMBED, SIZE),
+            ("encoder.bias", 1, EMBED),
+            ("attention.weight", attention * (2 * KEY + VALUE), EMBED),
+            ("hidden.weight", HIDDEN, EMBED),
+            ("hidden.context_weight", HIDDEN, attention * VALUE),
+            ("hidden.bias", 1, HIDDEN),
+            ("output.weight", OUT, HIDDEN),
+            ("output.bias", 1, OUT),
+            ("log_sigma", 1, OUT),
+        ]);
+        Self {
+            encoder,
+            encoder_bias,
+            attention,
+            hidden,
+            hidden_context,
+            hidden_bias,
+            output,
+            output_bias,
+            log_sigma,
+            len,
+        }
     }
 
     /// All blocks in order.
@@ -114,7 +127,8 @@ impl ActorLayout {
 
     /// The network that these parameters are, with the statistics of its observations.
     pub fn network(&self, parameters: &[f32], mean: [f32; SIZE], std: [f32; SIZE]) -> Network {
-        let dense = |weights: Vec<f32>, inputs: usize, outputs: usize, bias: Vec<f32>| Dense { inputs, outputs, weights, bias };
+        let dense =
+            |weights: Vec<f32>, inputs: usize, outputs: usize, bias: Vec<f32>| Dense { inputs, outputs, weights, bias };
         let part = |block: Block| parameters[block.range()].to_vec();
         let attention = !self.attention.is_empty();
         let qkv = if attention { part(self.attention) } else { vec![0.0; (2 * KEY + VALUE) * EMBED] };
@@ -359,9 +373,8 @@ impl ActorLayout {
         let rows = batch.samples * batch.modules;
         let tensors = tensors(parameters, self.blocks(), &device);
         let mean = self.forward(&tensors, batch, &device);
-        let column = |data: Vec<f32>, columns: usize| {
-            Tensor::<2>::from_data(TensorData::new(data, [rows, columns]), &device)
-        };
+        let column =
+            |data: Vec<f32>, columns: usize| Tensor::<2>::from_data(TensorData::new(data, [rows, columns]), &device);
         let Some(log_sigma) = tensors[8].clone() else { unreachable!("log sigma is never empty") };
         let actions = column(batch.actions.clone(), OUT);
         let advantages = batch.advantages.iter().flat_map(|a| std::iter::repeat_n(*a, batch.modules)).collect();
@@ -370,8 +383,7 @@ impl ActorLayout {
         // Constants of the density cancel in the ratio, but log sigma does not: it is being learnt.
         let offset = batch.log_probabilities.iter().map(|l| l + LOG_DENSITY_CONSTANT).collect();
         let distance = (actions - mean) * log_sigma.clone().neg().exp();
-        let log_ratio =
-            (distance.clone() * distance).sum_dim(1) * -0.5 - log_sigma.sum_dim(1) - column(offset, 1);
+        let log_ratio = (distance.clone() * distance).sum_dim(1) * -0.5 - log_sigma.sum_dim(1) - column(offset, 1);
         let ratio = log_ratio.clone().exp();
         let gain = ratio.clone() * advantages.clone();
         let clipped = ratio.clone().clamp(1.0 - loss.clip, 1.0 + loss.clip) * advantages;
@@ -407,8 +419,16 @@ pub fn log_probability(action: [f32; OUT], mean: [f32; OUT], log_sigma: [f32; OU
 impl CriticLayout {
     /// Values of a batch on the critic's scale, `[samples, 1]`.
     fn forward(&self, p: &[Option<Tensor<2>>; 8], batch: &Batch, device: &Device) -> Tensor<2> {
-        let [Some(first), Some(first_bias), Some(second), Some(second_bias), Some(team), Some(team_bias), Some(value), Some(value_bias)] =
-            p.each_ref().map(|tensor| tensor.clone())
+        let [
+            Some(first),
+            Some(first_bias),
+            Some(second),
+            Some(second_bias),
+            Some(team),
+            Some(team_bias),
+            Some(value),
+            Some(value_bias),
+        ] = p.each_ref().map(|tensor| tensor.clone())
         else {
             unreachable!("no block of the critic is empty");
         };
@@ -439,8 +459,7 @@ impl CriticLayout {
     pub fn gradient(&self, parameters: &[f32], batch: &Batch, weight: f32) -> Gradient {
         let device = Device::flex().autodiff();
         let tensors = tensors(parameters, self.blocks(), &device);
-        let targets =
-            Tensor::<2>::from_data(TensorData::new(batch.targets.clone(), [batch.samples, 1]), &device);
+        let targets = Tensor::<2>::from_data(TensorData::new(batch.targets.clone(), [batch.samples, 1]), &device);
         let error = self.forward(&tensors, batch, &device) - targets;
         let loss = (error.clone() * error).sum() * (0.5 * weight);
         let gradient = collect(&loss, tensors, self.blocks(), self.len);

@@ -106,7 +106,13 @@ impl Lane {
 ///
 /// `weight` is what a module that acts weighs in the actor's loss. Everything a policy was limited by in the rollout (who heard whom,
 /// who acted) comes along, or the ratio of the new to the old policy would be wrong.
-pub fn gather(lanes: &[Lane], samples: &[(u32, u32)], modules: usize, weight: f32, target: impl Fn(f32) -> f32) -> Batch {
+pub fn gather(
+    lanes: &[Lane],
+    samples: &[(u32, u32)],
+    modules: usize,
+    weight: f32,
+    target: impl Fn(f32) -> f32,
+) -> Batch {
     let rows = samples.len() * modules;
     let mut batch = Batch {
         samples: samples.len(),

@@ -101,7 +101,8 @@ fn attend(latent: &[f32], i: usize, heard: u64, weights: &mut Vec<f32>, context:
     for (j, other) in latent.chunks_exact(LATENT).enumerate() {
         let mut score = f32::NEG_INFINITY;
         if heard >> j & 1 == 1 {
-            score = query.iter().zip(&other[KEY..2 * KEY]).map(|(q, k)| q * k).sum::<f32>() * (KEY as f32).sqrt().recip();
+            score =
+                query.iter().zip(&other[KEY..2 * KEY]).map(|(q, k)| q * k).sum::<f32>() * (KEY as f32).sqrt().recip();
         }
         weights.push(score);
         largest = largest.max(score);

@@ -155,7 +155,8 @@ pub fn orthogonal(rows: usize, columns: usize, gain: f32, rng: &mut impl Rng) ->
     let (count, length) = (rows.min(columns), rows.max(columns));
     let mut basis: Vec<Vec<f64>> = Vec::with_capacity(count);
     while basis.len() < count {
-        let mut v: Vec<f64> = (0..length.div_ceil(2)).flat_map(|_| normal_pair(rng)).map(f64::from).take(length).collect();
+        let mut v: Vec<f64> =
+            (0..length.div_ceil(2)).flat_map(|_| normal_pair(rng)).map(f64::from).take(length).collect();
         // Gram-Schmidt, twice: once alone leaves rounding errors in the last vectors.
         for _ in 0..2 {
             for b in &basis {

@@ -13,7 +13,7 @@ use super::{Adam, Method, Stream, clip_norm, stream};
 
 /// Samples (steps of one environment) in one graph of tensors: small enough that a graph stays in the cache of a core, large enough
 /// that the overhead of a tensor operation does not count.
-pub const CHUNK: usize = 32;
+pub const CHUNK: usize = 64;
 
 /// Settings of the update. See [`crate::train::TrainConfig`], where they are documented and checked.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -164,8 +164,10 @@ pub fn update(
     (run_seed, iteration): (u64, u64),
     threads: usize,
 ) -> UpdateStats {
-    let mut stats =
-        UpdateStats { explained_variance: estimate_advantages(lanes, learner, settings, threads), ..Default::default() };
+    let mut stats = UpdateStats {
+        explained_variance: estimate_advantages(lanes, learner, settings, threads),
+        ..Default::default()
+    };
     let (actor, critic) = (ActorLayout::new(method), CriticLayout::default());
     standardise(lanes);
 
@@ -205,7 +207,8 @@ pub fn update(
             let chunks: Vec<_> = minibatch.chunks(CHUNK).collect();
             let gradients = parallel(&chunks, threads, |chunk| {
                 let batch = gather(lanes, chunk, modules, weight, |r| norm.normalise(r));
-                let of_actor = if with_actor { actor.gradient(&learner.actor, &batch, loss) } else { Gradient::default() };
+                let of_actor =
+                    if with_actor { actor.gradient(&learner.actor, &batch, loss) } else { Gradient::default() };
                 let of_critic = if with_critic {
                     critic.gradient(&learner.critic, &batch, 1.0 / minibatch.len() as f32)
                 } else {
@@ -333,7 +336,8 @@ mod tests {
             for (row, weight) in batch.weights.iter().enumerate() {
                 if *weight > 0.0 {
                     let pair = |v: &[f32]| -> [f32; OUT] { [v[row * OUT], v[row * OUT + 1]] };
-                    let new = crate::methods::actor_critic::log_probability(pair(&batch.actions), pair(&means), log_sigma);
+                    let new =
+                        crate::methods::actor_critic::log_probability(pair(&batch.actions), pair(&means), log_sigma);
                     let ratio = (new - batch.log_probabilities[row]).exp();
                     assert!((ratio - 1.0).abs() < 1e-4, "{method} row {row}: {ratio}");
                     checked += 1;
@@ -378,7 +382,12 @@ mod tests {
     }
 
     /// Compares a gradient with central differences of the loss, along each of some single parameters and along the gradient.
-    fn against_differences(parameters: &[f32], gradient: &[f32], loss: impl Fn(&[f32]) -> f64, blocks: &[crate::methods::Block]) {
+    fn against_differences(
+        parameters: &[f32],
+        gradient: &[f32],
+        loss: impl Fn(&[f32]) -> f64,
+        blocks: &[crate::methods::Block],
+    ) {
         let slope = |direction: &dyn Fn(usize) -> f32, h: f32| {
             let moved = |sign: f32| -> Vec<f32> {
                 parameters.iter().enumerate().map(|(i, p)| p + sign * h * direction(i)).collect()
@@ -396,7 +405,11 @@ mod tests {
             let largest = block.range().max_by(|a, b| gradient[*a].abs().total_cmp(&gradient[*b].abs())).unwrap();
             let single = slope(&|i| if i == largest { 1.0 } else { 0.0 }, 1e-2);
             let expected = f64::from(gradient[largest]);
-            assert!((single - expected).abs() < 0.05 * expected.abs() + 2e-4, "{}: {expected}, slope {single}", block.name);
+            assert!(
+                (single - expected).abs() < 0.05 * expected.abs() + 2e-4,
+                "{}: {expected}, slope {single}",
+                block.name
+            );
         }
     }
 
@@ -413,7 +426,8 @@ mod tests {
                 let mut sum = 0.0;
                 for row in 0..batch.weights.len() {
                     let pair = |v: &[f32]| -> [f32; OUT] { [v[row * OUT], v[row * OUT + 1]] };
-                    let new = crate::methods::actor_critic::log_probability(pair(&batch.actions), pair(&means), log_sigma);
+                    let new =
+                        crate::methods::actor_critic::log_probability(pair(&batch.actions), pair(&means), log_sigma);
                     let ratio = f64::from(new - batch.log_probabilities[row]).exp();
                     let advantage = f64::from(batch.advantages[row / batch.modules]);
                     let gain = (ratio * advantage).min(ratio.clamp(0.8, 1.2) * advantage);
@@ -460,7 +474,8 @@ mod tests {
     fn an_update_does_not_depend_on_the_threads() {
         let results = [1, 2, 3].map(|threads| {
             let (mut learner, mut lanes) = rollout(Method::ComposerNoImagination);
-            let stats = update(&mut learner, Method::ComposerNoImagination, &mut lanes, &SETTINGS, 1e-3, (5, 0), threads);
+            let stats =
+                update(&mut learner, Method::ComposerNoImagination, &mut lanes, &SETTINGS, 1e-3, (5, 0), threads);
             (learner, stats)
         });
         assert_eq!(results[0], results[1]);
