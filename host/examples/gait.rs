@@ -8,6 +8,9 @@ fn main() {
         r.damping = 0.874;
         r.torque_slew = 1e9;
     }
+    if let Ok(v) = std::env::var("SLEW") {
+        r.torque_slew = v.parse().unwrap();
+    }
     if let Some(i) = args.next() {
         r.solver_iterations = i.parse().unwrap();
     }
@@ -25,7 +28,7 @@ fn main() {
     println!("settled energy {e0} -> {} height {} gap {}", s.energy(), s.height(), s.joint_gap());
     let h0 = s.head();
     let t = std::time::Instant::now();
-    let n = (30.0 / r.physics_step) as i32;
+    let n = (10.0 / r.physics_step) as i32;
     let mut high = 0.0f32;
     let mut gap = 0.0f32;
     for i in 0..n {

@@ -82,7 +82,7 @@ pub enum Told {
 /// two fields of the observation of those who are told.
 ///
 /// The reward of a step is `1 - mean squared error` over the modules that act, at most 1. An episode has [`Trivial::STEPS`] steps and
-/// ends by truncation. With [`Told::Head`] a team that cannot talk earns at most about 1 - 7/8 * 2 * 0.33 / 2 on average.
+/// ends by truncation. With [`Told::Head`] a team of n that cannot talk earns at most 1 - (n - 1) / 3n on average, by the head alone.
 #[derive(Clone, Debug)]
 pub struct Trivial {
     modules: usize,

@@ -56,7 +56,7 @@ pub struct Limits {
 
 impl Default for Limits {
     fn default() -> Self {
-        Limits { torque: 80.0, torque_slew: 400.0, joint_angle: 3.1, joint_speed: 3.0, temperature: 80.0 }
+        Limits { torque: 80.0, torque_slew: 200.0, joint_angle: 3.1, joint_speed: 3.0, temperature: 80.0 }
     }
 }
 
@@ -82,9 +82,9 @@ mod tests {
     #[test]
     fn a_command_is_clamped_and_slewed() {
         let limits = Limits::default();
-        assert_eq!(limits.command(0.0, 1.0, 0.05), 20.0);
-        assert_eq!(limits.command(70.0, 5.0, 0.05), 80.0);
-        assert_eq!(limits.command(80.0, -1.0, 0.05), 60.0);
-        assert_eq!(limits.command(10.0, f32::NAN, 0.05), 0.0);
+        assert_eq!(limits.command(0.0, 1.0, 0.05), 10.0);
+        assert_eq!(limits.command(75.0, 5.0, 0.05), 80.0);
+        assert_eq!(limits.command(80.0, -1.0, 0.05), 70.0);
+        assert_eq!(limits.command(5.0, f32::NAN, 0.05), 0.0);
     }
 }

@@ -5,8 +5,16 @@ mod common;
 use common::{command, refuse, snakectl, succeed};
 use composer_shared::policies;
 
-const TINY: [&str; 8] =
-    ["--set", "environments=2", "--set", "rollout_steps=16", "--set", "evaluate_every=0", "--evaluation-episodes", "1"];
+const TINY: [&str; 8] = [
+    "--set",
+    "environments=2",
+    "--set",
+    "rollout_steps=16",
+    "--set",
+    "evaluate_every=0",
+    "--set",
+    "evaluation_episodes=1",
+];
 
 fn train<'a>(more: &[&'a str]) -> Vec<&'a str> {
     [&["train", "goal-reaching"], more, &TINY[..]].concat()
@@ -90,7 +98,8 @@ fn a_robot_that_cannot_be_is_refused() {
     refuse(folder.path(), &["eval", "goal-reaching", "--modules", "65"], &["65", "1 to 64"]);
     refuse(folder.path(), &["sil", "goal-reaching", "--modules", "0"], &["modules = 0"]);
     // A robot whose limits the policy was not trained for.
-    std::fs::write(folder.path().join("robot.toml"), good.replace("torque_limit = 80.0", "torque_limit = 40.0")).unwrap();
+    std::fs::write(folder.path().join("robot.toml"), good.replace("torque_limit = 80.0", "torque_limit = 40.0"))
+        .unwrap();
     refuse(folder.path(), &["sil", "goal-reaching", "--robot", "robot.toml"], &["trained for"]);
     assert!(!folder.path().join("runs").exists(), "a refused run leaves nothing behind");
 }
@@ -109,7 +118,11 @@ fn settings_flags_and_faults_are_checked() {
     refuse(folder.path(), &["sil", "goal-reaching", "--drop", "2"], &["probability"]);
     refuse(folder.path(), &["eval", "goal-reaching", "--episodes", "0"], &["0"]);
     refuse(folder.path(), &["export", ".", "-o", "x.policy"], &["config.toml"]);
-    refuse(folder.path(), &["sil", "goal-reaching", "--episodes", "1", "--replay", "no/such/folder.html"], &["no/such"]);
+    refuse(
+        folder.path(),
+        &["sil", "goal-reaching", "--episodes", "1", "--replay", "no/such/folder.html"],
+        &["no/such"],
+    );
 }
 
 #[test]
@@ -130,7 +143,7 @@ fn a_run_survives_kill_and_other_folders_other_robots_and_full_disks_are_refused
     }
     child.kill().unwrap();
     child.wait().unwrap();
-    succeed(path, &["train", "--resume", "killed", "--evaluation-episodes", "1"]);
+    succeed(path, &["train", "--resume", "killed"]);
     let network = |run: &str| std::fs::read(path.join(run).join("network.json")).unwrap();
     assert_eq!(network("whole"), network("killed"), "the same bits as without the kill");
 
@@ -159,7 +172,7 @@ fn a_run_survives_kill_and_other_folders_other_robots_and_full_disks_are_refused
     assert!(!output.status.success() && complaint.contains("checkpoint"), "{complaint}");
     assert!(!complaint.contains("panicked"), "{complaint}");
     assert_eq!(before, std::fs::read(path.join("whole/checkpoint.bin")).unwrap());
-    succeed(path, &["train", "--resume", "whole", "--steps", "704", "--evaluation-episodes", "1"]);
+    succeed(path, &["train", "--resume", "whole", "--steps", "704"]);
 }
 
 #[test]

@@ -169,11 +169,11 @@ impl Net {
         let until = self.now + time;
         loop {
             let due = |(node, outputs): (&Option<Controller>, &Outputs)| node.as_ref().map(|_| outputs.deadline);
-            let next = self.nodes.iter().zip(&self.outputs).filter_map(due).min().unwrap_or(until);
-            if next > until {
+            let next = self.nodes.iter().zip(&self.outputs).filter_map(due).min();
+            let Some(next) = next.filter(|next| *next <= until) else {
                 self.now = until;
                 return;
-            }
+            };
             self.now = next.max(self.now);
             for i in 0..self.nodes.len() {
                 if self.outputs[i].deadline <= self.now {

@@ -96,7 +96,7 @@ fn finish(run: &Run, arguments: &Arguments) -> Result<bool> {
     if resuming && load_config(&run.folder.join(CONFIG_FILE))? != config {
         bail!("{} holds a run with other settings; choose another --runs folder", run.folder.display());
     }
-    if train_in(&config, &run.folder, resuming, 50)?.interrupted {
+    if train_in(&config, &run.folder, resuming)?.interrupted {
         return Ok(false);
     }
     let (config, network) = load_run(&run.folder)?;

@@ -50,9 +50,6 @@ pub struct Arguments {
     /// Change one setting, such as learning_rate=3e-4 or faults.probability=0.5; may be repeated
     #[arg(long = "set", value_name = "KEY=VALUE")]
     settings: Vec<String>,
-    /// Episodes of each evaluation during training
-    #[arg(long, default_value_t = 50, value_parser = clap::value_parser!(u64).range(1..=100_000))]
-    evaluation_episodes: u64,
 }
 
 /// Runs the verb.
@@ -86,7 +83,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
     config.validate()?;
     let name = format!("{}-{}-{}", arguments.task, config.train.method, config.train.seed);
     let out = arguments.resume.or(arguments.out).unwrap_or_else(|| Path::new("runs").join(name));
-    let summary = train_in(&config, &out, resuming, arguments.evaluation_episodes as usize)?;
+    let summary = train_in(&config, &out, resuming)?;
     println!(
         "{} after {} steps, {:.0} s in this session: {}",
         if summary.interrupted { "stopped" } else { "done" },
@@ -102,7 +99,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
 
 /// Starts a run in the folder `out`, or goes on with the one that is there. Judges the policy every so often, healthy and (if it trains with
 /// faults) faulty, and keeps the network of the last judgement.
-pub fn train_in(config: &RunConfig, out: &Path, resuming: bool, evaluation_episodes: usize) -> Result<TrainSummary> {
+pub fn train_in(config: &RunConfig, out: &Path, resuming: bool) -> Result<TrainSummary> {
     create_folder(out)?;
     if !resuming {
         if out.join(CONFIG_FILE).exists() {
@@ -115,7 +112,7 @@ pub fn train_in(config: &RunConfig, out: &Path, resuming: bool, evaluation_episo
     let mut judge = |network: &Network, _steps: u64| {
         let trial = Trial {
             config: &evaluation,
-            episodes: evaluation_episodes,
+            episodes: config.train.evaluation_episodes.max(1) as usize,
             seed: EVALUATION_SEED,
             faults: &healthy,
             threads: super::cores(),

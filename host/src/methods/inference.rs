@@ -10,7 +10,7 @@ use super::kernels::{dense, tanh};
 /// Query, key and value of one module in a row.
 const LATENT: usize = 2 * KEY + VALUE;
 
-/// The actor's weights, laid out for [`dense`]: one row per input.
+/// The actor's weights, laid out for the inner loops: one row per input.
 #[derive(Clone, Debug)]
 pub struct Inference {
     encoder: Vec<f32>,

@@ -18,9 +18,8 @@ fn fast() -> bool {
 /// `x` is `[rows][inputs]`, `w` is `[inputs][OUTPUTS]`, `y` is `[rows][OUTPUTS]`; OUTPUTS is a multiple of 16.
 pub fn dense<const OUTPUTS: usize>(x: &[f32], inputs: usize, w: &[f32], bias: Option<&[f32]>, y: &mut [f32]) {
     assert!(OUTPUTS.is_multiple_of(COLUMNS) && w.len() == inputs * OUTPUTS && x.len() / inputs == y.len() / OUTPUTS);
-    match bias {
-        Some(bias) => y.chunks_exact_mut(OUTPUTS).for_each(|y| y.copy_from_slice(bias)),
-        None => {}
+    if let Some(bias) = bias {
+        y.chunks_exact_mut(OUTPUTS).for_each(|y| y.copy_from_slice(bias));
     }
     #[cfg(target_arch = "x86_64")]
     if fast() {

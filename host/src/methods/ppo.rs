@@ -79,7 +79,7 @@ pub struct UpdateStats {
     pub value_loss: f64,
     /// Estimated KL divergence of the last minibatch of the actor.
     pub approx_kl: f64,
-    /// Largest difference of a ratio from 1 on the very first minibatch: rounding only, or rollout and update disagree.
+    /// The same of the very first minibatch, before anything was learnt: rounding only, or rollout and update disagree.
     pub first_kl: f64,
     /// Share of clipped ratios over the actor's minibatches.
     pub clip_fraction: f64,

@@ -1,6 +1,7 @@
 //! The checkpoint: one file with all that a run needs to go on bit for bit.
 //!
-//! Layout, little-endian: magic `CMPSRCK1`, then fields as written by [`Checkpoint::encode`], then the CRC-32 of everything before.
+//! Layout, little-endian: magic `CMPSRCK1`, then the fields of [`Checkpoint`] in order (lists and texts after
+//! their length as u64), then the CRC-32 of everything before.
 //! A new one is written beside the old one, made durable and renamed, so that there is a whole one at every moment.
 
 use std::fs::{self, File};
@@ -35,7 +36,9 @@ pub enum CheckpointError {
     #[error("the checkpoint {0} is damaged (its checksum is wrong); it cannot be resumed from")]
     Damaged(String),
     /// The file could not be written.
-    #[error("no checkpoint can be written to {0}: {1}. Training stops here; what the folder held before is untouched")]
+    #[error(
+        "no checkpoint can be written to {0}: {1}. Training stops here. If the folder held a checkpoint, it is untouched: make room, then go on with --resume"
+    )]
     Write(String, io::Error),
 }
 

@@ -1,6 +1,6 @@
 //! `metrics.jsonl`: one JSON object per iteration, flat, with the names TensorBoard shows.
 
-use std::fs::{File, OpenOptions};
+use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufRead, BufReader, Write};
 use std::path::Path;
 
@@ -31,11 +31,10 @@ impl Metrics {
                     value.get("iteration").and_then(serde_json::Value::as_u64).is_some_and(|i| i <= iterations)
                 })
                 .collect();
-            let mut file = tempfile::NamedTempFile::new_in(folder)?;
-            for line in kept {
-                writeln!(file, "{line}")?;
-            }
-            file.persist(&path).map_err(|error| error.error)?;
+            let temporary = folder.join("metrics.tmp");
+            let text: String = kept.into_iter().flat_map(|line| [line, "\n".into()]).collect();
+            fs::write(&temporary, text)?;
+            fs::rename(temporary, &path)?;
         }
         let lines = OpenOptions::new().create(true).append(true).open(path)?;
         Ok(Self { lines, events: EventWriter::create(folder, steps)? })

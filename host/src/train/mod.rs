@@ -27,13 +27,13 @@ use crate::methods::ppo::{Learner, PpoSettings, update};
 use crate::methods::rollout::{Frozen, Iteration, Slot, collect};
 use crate::network::Network;
 
-/// Settings of a training run. Every field has a default; TOML files and `--set key=value` change single ones.
+/// Settings of the learner. Every field has a default, so that a TOML file needs to name only what it changes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrainConfig {
     /// How the policy is built and trained.
     pub method: Method,
-    /// Seed of the run: same seed, same policy, bit for bit.
+    /// Seed of the run: same seed, same policy, bit for bit, on the same kind of processor.
     pub seed: u64,
     /// Environment steps (control steps of one snake) in all.
     pub total_steps: u64,
@@ -71,6 +71,8 @@ pub struct TrainConfig {
     pub sigma: f64,
     /// Environment steps between two evaluations; 0 for none.
     pub evaluate_every: u64,
+    /// Episodes of each evaluation.
+    pub evaluation_episodes: u64,
     /// Seconds between two checkpoints.
     pub checkpoint_seconds: f64,
     /// Threads; 0 for one per core. The result does not depend on it.
@@ -100,6 +102,7 @@ impl Default for TrainConfig {
             entropy: 0.0,
             sigma: 0.45,
             evaluate_every: 100_000,
+            evaluation_episodes: 50,
             checkpoint_seconds: 60.0,
             threads: 0,
         }
@@ -107,32 +110,6 @@ impl Default for TrainConfig {
 }
 
 impl TrainConfig {
-    /// Changes one setting, as `--set key=value` does. The value is TOML; a bare word counts as a string.
-    pub fn set(&mut self, assignment: &str) -> Result<()> {
-        let Some((key, value)) = assignment.split_once('=') else {
-            bail!("`{assignment}` is no setting: write key=value, such as learning_rate=3e-4");
-        };
-        let (key, value) = (key.trim(), value.trim());
-        let mut table = toml::Table::try_from(&*self).context("the settings cannot be written as TOML")?;
-        let Some(old) = table.get(key) else {
-            let keys: Vec<_> = table.keys().map(String::as_str).collect();
-            bail!("there is no setting `{key}`; the settings are {}", keys.join(", "));
-        };
-        let mut new = match toml::from_str::<toml::Table>(&format!("x = {value}")) {
-            Ok(mut parsed) => parsed.remove("x").unwrap_or_else(|| toml::Value::String(value.into())),
-            Err(_) => toml::Value::String(value.into()),
-        };
-        // 1 is as good as 1.0 where a number with a point belongs.
-        if let (toml::Value::Float(_), toml::Value::Integer(i)) = (old, &new) {
-            new = toml::Value::Float(*i as f64);
-        }
-        table.insert(key.into(), new);
-        let changed: Self =
-            table.try_into().map_err(|error| anyhow::anyhow!("{key}={value} is not possible: {}", error.message()))?;
-        *self = changed;
-        Ok(())
-    }
-
     /// Says what is wrong with the settings, if anything is.
     pub fn validate(&self) -> Result<()> {
         let positive = [
@@ -158,7 +135,7 @@ impl TrainConfig {
         if !(self.entropy.is_finite() && self.entropy >= 0.0) {
             bail!("entropy is {}; it must be 0 or more", self.entropy);
         }
-        if !(self.checkpoint_seconds >= 0.0) {
+        if self.checkpoint_seconds.is_nan() || self.checkpoint_seconds < 0.0 {
             bail!("checkpoint_seconds is {}; it must be 0 or more", self.checkpoint_seconds);
         }
         let limits = [
@@ -301,6 +278,7 @@ impl Trainer {
         let mut was = config_of(checkpoint)?;
         was.total_steps = config.total_steps;
         was.evaluate_every = config.evaluate_every;
+        was.evaluation_episodes = config.evaluation_episodes;
         was.checkpoint_seconds = config.checkpoint_seconds;
         was.threads = config.threads;
         if was != *config {
@@ -714,43 +692,31 @@ mod tests {
     }
 
     #[test]
-    fn settings_are_set_by_name_and_checked() {
-        let mut config = TrainConfig::default();
-        config.set("learning_rate=3e-4").unwrap();
-        config.set("gamma = 1").unwrap();
-        config.set("method=mappo").unwrap();
-        config.set("environments=8").unwrap();
-        assert_eq!((config.learning_rate, config.gamma, config.environments), (3e-4, 1.0, 8));
-        assert_eq!(config.method, Method::Mappo);
-        for (assignment, complaint) in [
-            ("gamma", "key=value"),
-            ("gama=0.9", "no setting `gama`"),
-            ("gamma=high", "gamma=high is not possible"),
-            ("environments=-1", "environments=-1 is not possible"),
-            ("method=ppo2", "composer-no-imagination"),
+    fn settings_are_checked() {
+        TrainConfig::default().validate().unwrap();
+        for (text, complaint) in [
+            ("gamma = 1.5", "gamma is 1.5; it must be from 0 to 1"),
+            ("environments = 0", "environments is 0; it must be from 1 to 4096"),
+            ("minibatches = 1000000", "minibatches is 1000000; it must be from 1 to 2048"),
+            ("sigma = 0.0", "sigma is 0; it must be a number above 0"),
+            ("total_steps = 0", "total_steps is 0"),
+            ("learning_rate = nan", "learning_rate is NaN"),
+            ("entropy = -0.1", "entropy is -0.1; it must be 0 or more"),
         ] {
-            let error = config.set(assignment).unwrap_err().to_string();
-            assert!(error.contains(complaint), "{error}");
-        }
-        config.validate().unwrap();
-        for (assignment, complaint) in [
-            ("gamma=1.5", "gamma is 1.5; it must be from 0 to 1"),
-            ("environments=0", "environments is 0"),
-            ("minibatches=1000000", "minibatches is 1000000"),
-            ("sigma=0", "sigma is 0"),
-            ("total_steps=0", "total_steps is 0"),
-            ("learning_rate=nan", "learning_rate is NaN"),
-        ] {
-            let mut config = TrainConfig::default();
-            config.set(assignment).unwrap();
+            let config: TrainConfig = toml::from_str(text).unwrap();
             let error = config.validate().unwrap_err().to_string();
             assert!(error.contains(complaint), "{error}");
         }
         assert!(toml::from_str::<TrainConfig>("gammma = 1.0").unwrap_err().message().contains("gammma"));
-        assert_eq!(
-            config_of(&Trainer::new(&small(Method::Mappo), &teams, "x").unwrap().checkpoint().unwrap()).unwrap(),
-            small(Method::Mappo)
+        assert!(
+            toml::from_str::<TrainConfig>("method = \"ppo2\"")
+                .unwrap_err()
+                .message()
+                .contains("composer-no-imagination")
         );
+        let config = small(Method::Mappo);
+        let checkpoint = Trainer::new(&config, &teams, "trivial").unwrap().checkpoint().unwrap();
+        assert_eq!(config_of(&checkpoint).unwrap(), config);
     }
 
     #[test]
