@@ -814,6 +814,10 @@ fn seal(image: &mut [u8; IMAGE_SIZE]) {
     }
 }
 
+/// Limits in the header of a [`random_image`].
+const RANDOM_LIMITS: Limits =
+    Limits { torque: 80.0, torque_slew: 400.0, joint_angle: 3.1, joint_speed: 3.0, temperature: 80.0 };
+
 /// An untrained policy with weights drawn from `seed`, for tests: activations of about the size that trained networks
 /// have, paper's robot, control period 50 ms, with attention.
 pub fn random_image(seed: u32, image: &mut [u8; IMAGE_SIZE]) {
@@ -823,7 +827,8 @@ pub fn random_image(seed: u32, image: &mut [u8; IMAGE_SIZE]) {
         attention: true,
         trained_with_faults: false,
         geometry: Geometry::default(),
-        limits: Limits::default(),
+        // Not the default, which may be tuned: the image's bits are pinned.
+        limits: RANDOM_LIMITS,
         control_period_us: 50_000,
         relax_seconds: 0.25,
     };
@@ -903,7 +908,7 @@ mod tests {
         let policy = Policy::parse(&image[..]).unwrap();
         assert_eq!(policy.task(), Task::GoalReaching);
         assert_eq!(policy.geometry(), Geometry::default());
-        assert_eq!(policy.limits(), Limits::default());
+        assert_eq!(policy.limits(), RANDOM_LIMITS);
         assert_eq!((policy.control_period_us(), policy.relax_seconds()), (50_000, 0.25));
         assert_eq!(u32::from(policy.tag()), policy.crc() & 0xffff);
         assert_ne!(policy.tag(), Policy::parse(&random(2)[..]).unwrap().tag());
