@@ -334,15 +334,13 @@ impl Environment for SnakeEnv {
     }
 
     fn step(&mut self, actions: &[[f32; 2]]) -> Outcome {
-        for module in 0..self.modules() {
+        for (module, (command, action)) in self.command.iter_mut().zip(actions).enumerate() {
             if self.now.gone >> module & 1 == 1 {
-                self.command[module] = [0.0; 2];
-                self.snake.set_torque(module, [0.0; 2]);
+                *command = [0.0; 2];
+                self.snake.set_torque(module, *command);
             } else {
-                for axis in 0..2 {
-                    let previous = self.command[module][axis];
-                    self.command[module][axis] =
-                        self.limits.command(previous, actions[module][axis], self.config.control_period);
+                for (previous, wanted) in command.iter_mut().zip(action) {
+                    *previous = self.limits.command(*previous, *wanted, self.config.control_period);
                 }
             }
         }

@@ -17,6 +17,7 @@ use crate::tasks::goal_reaching::Bearing;
 
 /// Who decides the torques.
 #[derive(Clone, Copy)]
+#[allow(clippy::large_enum_variant)] // A view into an image; it is copied once an episode.
 pub enum Pilot<'a> {
     /// The network as it was trained, in 32-bit floats.
     Float(&'a Network),

@@ -95,7 +95,7 @@ impl Plant for SnakePlant {
     fn step(&mut self) {
         self.snake.step();
         self.physics_steps += 1;
-        if self.physics_steps % self.config.substeps() == 0 {
+        if self.physics_steps.is_multiple_of(self.config.substeps()) {
             self.distance = self.measure();
             self.success |= self.distance < self.config.task.success_distance;
             if self.snake.height() < 4.0 * self.config.robot.link_radius {

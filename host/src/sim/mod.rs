@@ -95,7 +95,7 @@ impl Snake {
             world.colliders.insert_with_parent(collider, handle, &mut world.bodies);
             if let Some(&front) = links.last() {
                 let joint_in_module = (link - 1) % robot.links_per_module;
-                let axis = if joint_in_module % 2 == 0 { Vector::Z } else { Vector::Y };
+                let axis = if joint_in_module.is_multiple_of(2) { Vector::Z } else { Vector::Y };
                 let joint = GenericJointBuilder::new(JointAxesMask::LOCKED_REVOLUTE_AXES)
                     .local_axis1(axis)
                     .local_axis2(axis)
@@ -225,14 +225,14 @@ impl Snake {
 
     fn joint_speed(&self, index: usize) -> f32 {
         let (front, rear) = (&self.world.bodies[self.links[index]], &self.world.bodies[self.links[index + 1]]);
-        let axis = if (index % self.robot.links_per_module) % 2 == 0 { Vector::Z } else { Vector::Y };
+        let axis = if (index % self.robot.links_per_module).is_multiple_of(2) { Vector::Z } else { Vector::Y };
         (rear.angvel() - front.angvel()).dot(front.rotation() * axis)
     }
 
     fn joint_angle(&self, index: usize) -> f32 {
         let (front, rear) = (&self.world.bodies[self.links[index]], &self.world.bodies[self.links[index + 1]]);
         let relative = front.rotation().inverse() * *rear.rotation();
-        let axial = if (index % self.robot.links_per_module) % 2 == 0 { relative.z } else { relative.y };
+        let axial = if (index % self.robot.links_per_module).is_multiple_of(2) { relative.z } else { relative.y };
         let angle = 2.0 * libm::atan2f(axial, relative.w);
         // q and -q are the same rotation.
         if angle > std::f32::consts::PI {
