@@ -1,30 +1,33 @@
 //! Files that are whole or not there: written beside their place, synced, then renamed.
 
-use std::io::Write;
+use std::fs::File;
+use std::io::{self, Write};
 use std::path::Path;
 
 use anyhow::{Context, Result};
 
-/// Writes a file so that a kill, a full disk or a crash leaves either the old content or the new, never a part.
-pub fn write_whole(path: &Path, content: &[u8]) -> Result<()> {
+/// Replaces a file, or makes it: a kill, a full disk or a crash leaves either the old content or the new, never a part.
+pub fn replace(path: &Path, content: &[u8]) -> io::Result<()> {
     let folder = match path.parent() {
         Some(folder) if !folder.as_os_str().is_empty() => folder,
         _ => Path::new("."),
     };
-    let attempt = || -> std::io::Result<()> {
-        let mut file = tempfile::Builder::new().prefix(".new-").tempfile_in(folder)?;
-        file.write_all(content)?;
-        // A temporary file is private; what ships is as readable as any other file.
-        #[cfg(unix)]
-        {
-            use std::os::unix::fs::PermissionsExt;
-            file.as_file().set_permissions(std::fs::Permissions::from_mode(0o644))?;
-        }
-        file.as_file().sync_all()?;
-        file.persist(path).map_err(|e| e.error)?;
-        Ok(())
-    };
-    attempt().with_context(|| {
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(".new-");
+    // A temporary file is private by default; what is written here may be read by whom the umask allows.
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    let mut file = builder.tempfile_in(folder)?;
+    file.write_all(content)?;
+    file.as_file().sync_all()?;
+    file.persist(path).map_err(|e| e.error)?;
+    // The rename itself must reach the disk, too.
+    File::open(folder)?.sync_all()
+}
+
+/// [`replace`], with a sentence that says which file could not be written.
+pub fn write_whole(path: &Path, content: &[u8]) -> Result<()> {
+    replace(path, content).with_context(|| {
         format!("cannot write {}; is the folder there, writable, and the disk not full?", path.display())
     })
 }

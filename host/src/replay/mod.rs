@@ -15,10 +15,12 @@
 //! 125 frames of 8 modules with 4 links are about 90 kB on top of the page.
 
 use std::fs;
-use std::io::{self, Write};
+use std::io;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
+
+use crate::files;
 
 const PAGE: &str = include_str!("page.html");
 /// Finest step of a recorded position, robot units. Recordings wider than 65 units get a coarser one.
@@ -316,21 +318,11 @@ impl Recording {
             }
             Err(e) => return Err(fail(format!("make the folder {} first", folder.display()))(e)),
         }
-        let mut builder = tempfile::Builder::new();
-        builder.prefix(".replay-").suffix(".html.part");
-        // A temporary file is private by default; a replay is meant to be shared, within the limits of the umask.
-        #[cfg(unix)]
-        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-        let mut file = builder
-            .tempfile_in(folder)
-            .map_err(fail(format!("choose a folder that is writable, {} is not", folder.display())))?;
-        file.write_all(html.as_bytes()).and_then(|()| file.as_file().sync_all()).map_err(fail(format!(
-            "make {} kB of room in {}",
-            html.len().div_ceil(1000),
+        let size = html.len().div_ceil(1000);
+        files::replace(path, html.as_bytes()).map_err(fail(format!(
+            "choose a folder that is writable and has {size} kB of room, {} is not",
             folder.display()
-        )))?;
-        file.persist(path).map_err(|e| fail("the finished file could not be renamed to that name".into())(e.error))?;
-        Ok(())
+        )))
     }
 
     fn check(&self) -> Result<(), ReplayError> {
@@ -723,6 +715,6 @@ mod tests {
     fn a_folder_that_cannot_be_written_is_named() {
         // No user, not even root, can make a file there.
         let message = recording(2, 2).write_html(Path::new("/proc/replay.html")).unwrap_err().to_string();
-        assert!(message.contains("choose a folder that is writable, /proc is not"), "{message}");
+        assert!(message.contains("choose a folder that is writable") && message.contains("/proc is not"), "{message}");
     }
 }

