@@ -67,7 +67,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     }
     write_replay(&config, to_replay, name, &arguments.replay)?;
     println!(
-        "\n{} episodes a row. {} shows the first with a module unplugged: open it in any browser.",
+        "\n{} episodes a row; mean and standard error. {} shows the first with a module unplugged: open it in any browser.",
         arguments.episodes,
         arguments.replay.display()
     );
@@ -77,7 +77,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
 fn row(label: &str, report: &BusReport) -> String {
     let task = &report.task;
     format!(
-        "{label:<28} {:>4.2}+-{:.2} {:>6.2}+-{:<4.2} unit {:>6.1}+-{:<4.1} {:>7.1} % {:>8.0} x",
+        "{label:<28} {:>6.2} +- {:.2} {:>6.2} +- {:.2} {:>7.1} +- {:<4.1} {:>7.1} % {:>8.0} x",
         task.success_rate,
         task.success_rate_se,
         task.distance_mean,

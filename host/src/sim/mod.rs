@@ -6,7 +6,7 @@
 //! stiffnesses an explicit torque would need a tenth of the step.
 //!
 //! Ground, walls and blocks are frictionless for rapier; friction is an explicit anisotropic Coulomb force in the plane of each
-//! contact, with the contact's own load, normal and point ([`Snake::apply_friction`]).
+//! contact, with the contact's own load, normal and point (`Snake::apply_friction`).
 //!
 //! World frame: x and y horizontal, z up; the snake lies along x with its head towards +x.
 
