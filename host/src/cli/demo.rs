@@ -35,7 +35,10 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         config.robot.modules,
         image.len()
     );
-    println!("{:<28} {:>9} {:>15} {:>12} {:>9} {:>10}", "", "success", "distance", "steps", "bus load", "real time");
+    println!(
+        "{:<28} {:>14} {:>14} {:>16} {:>9} {:>10}",
+        "", "success", "distance/units", "control steps", "bus load", "real time"
+    );
     let rows = [
         ("all modules", "none"),
         ("one unplugged on the way", "unplug:1"),

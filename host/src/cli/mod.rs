@@ -47,6 +47,13 @@ enum Verb {
 
 /// Parses the command line, runs the verb, and reports an error as one sentence.
 pub fn main() -> ExitCode {
+    // `snakectl ... | head` ends quietly when its reader does; without this the next print would panic.
+    #[cfg(unix)]
+    let _ = signal_hook::flag::register_conditional_shutdown(
+        signal_hook::consts::SIGPIPE,
+        141,
+        std::sync::Arc::new(std::sync::atomic::AtomicBool::new(true)),
+    );
     let arguments = Arguments::parse();
     let result = match arguments.verb {
         Some(Verb::Train(arguments)) => train::run(arguments),
