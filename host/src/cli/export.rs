@@ -46,7 +46,7 @@ struct Manifest {
     /// Version control's name of the state that trained or at least froze it; "unknown" outside a repository.
     commit: String,
     trained_with_faults: bool,
-    /// Wall time of the run's last session on the machine that trained it, s.
+    /// Wall time of the run, since it was started or last resumed, on the machine that trained it, s.
     wall_seconds: f64,
     parity: Parity,
     measured: Vec<Measured>,

@@ -85,7 +85,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
     let out = arguments.resume.or(arguments.out).unwrap_or_else(|| Path::new("runs").join(name));
     let summary = train_in(&config, &out, resuming)?;
     println!(
-        "{} after {} steps, {:.0} s in this session: {}",
+        "{} after {} steps, {:.0} s since the start or the last resumption: {}",
         if summary.interrupted { "stopped" } else { "done" },
         summary.steps,
         summary.wall.as_secs_f64(),

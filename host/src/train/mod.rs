@@ -201,7 +201,7 @@ pub struct TrainSummary {
     pub iterations: u64,
     /// Whether the run was stopped before its end (and can be resumed).
     pub interrupted: bool,
-    /// Wall time of this session.
+    /// Wall time since the start or the last resumption.
     pub wall: Duration,
     /// What the last evaluation said.
     pub evaluation: Vec<(String, f64)>,
