@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
-use composer_firmware::controller::BusKind;
+use composer_firmware::controller::{BusKind, Timing};
 use composer_sim_bridge::faults::{FaultKind, PlannedFault};
 use composer_sim_bridge::frame_bits::BitRates;
 use composer_sim_bridge::sil::{self, SilConfig, SilReport};
@@ -205,6 +205,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         );
     };
     let config = Arc::new(source.environment(common.robot()?.as_ref())?);
+    warn_if_crowded(&arguments.bus, &config);
     let record = if arguments.replay.is_some() { REPLAYED } else { 0 };
     let trial = BusTrial { config: config.clone(), image, common, bus: &arguments.bus, record };
     let mut captured = Vec::new();
@@ -227,6 +228,20 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         println!("  written: {}", path.display());
     }
     Ok(())
+}
+
+/// Says so if the frames of a cycle do not fit the control period (at the default bit rates): it still runs, but the tail is never heard.
+fn warn_if_crowded(bus: &BusOptions, config: &EnvConfig) {
+    let kind = if bus.bus == Bus::Fd { BusKind::Fd } else { BusKind::Classic };
+    let needed_ms = f64::from(Timing::bus_time_us(kind, config.robot.modules as u8)) * 1e-3;
+    let period_ms = f64::from(config.control_period) * 1e3;
+    if bus.bitrate.is_none() && needed_ms > period_ms {
+        eprintln!(
+            "note: {} modules need {needed_ms:.0} ms of a {} bus in every {period_ms:.0} ms; those farthest from the head will not be heard",
+            config.robot.modules,
+            if kind == BusKind::Fd { "CAN-FD" } else { "classic CAN" }
+        );
+    }
 }
 
 /// The lines about the bus.
