@@ -210,13 +210,8 @@ impl SnakeEnv {
         self.steps = 0;
         self.episode_return = 0.0;
         self.low_steps = 0;
-        self.distance = self.measure();
+        self.distance = self.snake.head_distance(self.goal);
         self.sample();
-    }
-
-    fn measure(&self) -> f32 {
-        let [x, y, z] = self.snake.in_head_frame(self.goal);
-        libm::sqrtf(x * x + y * y + z * z)
     }
 
     /// Samples the sensors and lets everybody hear everybody, as one control cycle on the bus does.
@@ -359,7 +354,7 @@ impl Environment for SnakeEnv {
             self.low_steps += 1;
         }
         let before = self.distance;
-        self.distance = self.measure();
+        self.distance = self.snake.head_distance(self.goal);
         let success = self.distance < self.config.task.success_distance;
         let reward = self.config.task.reward(before, self.distance, success, height - 3.0 * radius);
         self.episode_return += reward;

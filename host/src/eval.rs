@@ -11,6 +11,7 @@ use serde::Serialize;
 
 use crate::env::{EnvConfig, SnakeEnv};
 use crate::environment::{Environment, View};
+use crate::methods::mix;
 use crate::network::Network;
 use crate::sim::Motion;
 use crate::tasks::goal_reaching::Bearing;
@@ -73,14 +74,6 @@ impl Pilot<'_> {
             }
         }
     }
-}
-
-/// SplitMix64's finaliser.
-fn mix(x: u64) -> u64 {
-    let mut z = x.wrapping_add(0x9e37_79b9_7f4a_7c15);
-    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    z ^ (z >> 31)
 }
 
 /// Seed of evaluation episode `index`. Training derives its seeds from other constants, so that it never sees these episodes.

@@ -29,13 +29,8 @@ impl SnakePlant {
         let goal = config.task.goal(seed, config.robot.link_radius);
         let mut plant =
             SnakePlant { config, snake, goal, physics_steps: 0, low_steps: 0, distance: 0.0, success: false };
-        plant.distance = plant.measure();
+        plant.distance = plant.snake.head_distance(plant.goal);
         plant
-    }
-
-    fn measure(&self) -> f32 {
-        let [x, y, z] = self.snake.in_head_frame(self.goal);
-        libm::sqrtf(x * x + y * y + z * z)
     }
 
     /// The snake.
@@ -96,7 +91,7 @@ impl Plant for SnakePlant {
         self.snake.step();
         self.physics_steps += 1;
         if self.physics_steps.is_multiple_of(self.config.substeps()) {
-            self.distance = self.measure();
+            self.distance = self.snake.head_distance(self.goal);
             self.success |= self.distance < self.config.task.success_distance;
             if self.snake.height() < 4.0 * self.config.robot.link_radius {
                 self.low_steps += 1;

@@ -155,10 +155,8 @@ impl BusTrial<'_> {
     ) -> Result<(BusReport, Vec<crate::replay::Episode>)> {
         let episodes = self.common.episodes as usize;
         self.common.fault.check(self.config.robot.modules)?;
-        for (name, p) in [("drop", self.bus.drop)] {
-            if p.is_some_and(|p| !(0.0..=1.0).contains(&p)) {
-                bail!("--{name} is a probability: 0 to 1");
-            }
+        if self.bus.drop.is_some_and(|p| !(0.0..=1.0).contains(&p)) {
+            bail!("--drop is a probability: 0 to 1");
         }
         if self.bus.delay.is_some_and(|ms| !(0.0..=1000.0).contains(&ms)) {
             bail!("--delay is 0 to 1000 ms");

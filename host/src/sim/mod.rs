@@ -289,6 +289,12 @@ impl Snake {
         self.world.bodies[self.links[0]].position().inverse_transform_point(Vector::from(point)).to_array()
     }
 
+    /// Distance of the centre of the head link to a world point.
+    pub fn head_distance(&self, point: [f32; 3]) -> f32 {
+        let [x, y, z] = self.in_head_frame(point);
+        libm::sqrtf(x * x + y * y + z * z)
+    }
+
     /// Position and rotation (quaternion x, y, z, w) of every link, from the head on.
     pub fn poses(&self) -> impl Iterator<Item = ([f32; 3], [f32; 4])> + '_ {
         self.links.iter().map(|&link| {
