@@ -1,0 +1,23 @@
+//! Gives the image of a board its memory layout (`boards/BOARD.x`) and linker scripts.
+
+use std::path::PathBuf;
+use std::{env, fs};
+
+fn main() {
+    println!("cargo::rerun-if-changed=boards");
+    let boards = ["qemu", "stm32g474"];
+    let chosen = boards
+        .into_iter()
+        .filter(|board| env::var_os(format!("CARGO_FEATURE_BOARD_{}", board.to_uppercase())).is_some());
+    let chosen: Vec<_> = chosen.collect();
+    let board = match &chosen[..] {
+        [] => return,
+        [board] => board,
+        several => panic!("choose one board, not {}", several.join(" and ")),
+    };
+    let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
+    fs::copy(format!("boards/{board}.x"), out.join("memory.x")).expect("the board's memory layout can be copied");
+    println!("cargo::rustc-link-search={}", out.display());
+    println!("cargo::rustc-link-arg-bins=--nmagic");
+    println!("cargo::rustc-link-arg-bins=-Tlink.x");
+}
