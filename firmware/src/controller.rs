@@ -28,8 +28,10 @@
 //!
 //! # Goal
 //!
-//! GOAL is given in the frame of the head link, so an old one becomes wrong as the head moves: without a new one it holds for
-//! [`Timing::goal_memory`] cycles, then the goal is unknown. A policy whose goal is known to the head uses it in module 0 only.
+//! GOAL frames tell points of the scene, of which a module keeps those that its policy's task observes
+//! ([`composer_shared::policy::Task::observed`]). They are given in the frame of the head link, so an old one becomes wrong as the head
+//! moves: without a new one it holds for [`Timing::goal_memory`] cycles, then the point is unknown. A policy whose goal is known to the
+//! head uses them in module 0 only.
 //!
 //! # Time
 //!
@@ -37,7 +39,7 @@
 //! counts as standing still.
 
 use composer_shared::kinematics::Chain;
-use composer_shared::observation::{Sensors, observe, place};
+use composer_shared::observation::{POINTS, Sensors, Told, observe, place};
 use composer_shared::policy::{Encoded, GoalKnownTo, Policy};
 use composer_shared::robot::{AXES, Limits, MAX_MODULES};
 use composer_shared::wire::{
@@ -92,7 +94,7 @@ pub struct Timing {
     pub sync_lost_after: u8,
     /// How much later than promised a poll may come before the watchdog latches.
     pub poll_grace_us: u32,
-    /// Cycles for which a goal holds when no new one comes.
+    /// Cycles for which a point of the scene holds when no new one comes.
     pub goal_memory: u8,
 }
 
@@ -101,7 +103,8 @@ impl Timing {
     /// bus time of all modules' frames plus 5 ms, at least 20 % and at most 80 % of the period; the state deadline is a third of it.
     pub fn for_policy(policy: &Policy<'_>, bus: BusKind, modules: u8) -> Self {
         let period_us = policy.control_period_us();
-        let needed = Self::bus_time_us(bus, modules).saturating_mul(2).saturating_add(5_000);
+        let points = policy.task().points(modules);
+        let needed = Self::bus_time_us(bus, modules, points).saturating_mul(2).saturating_add(5_000);
         let collect_deadline_us = needed.max(period_us / 5).min(period_us / 5 * 4);
         Timing {
             period_us,
@@ -117,14 +120,15 @@ impl Timing {
         }
     }
 
-    /// About how long the STATE and LATENT frames of all modules occupy the bus in one cycle, with worst-case bit stuffing at
-    /// 1 Mbit/s and 5 Mbit/s. If this exceeds the period, the modules farthest from the head are never heard.
-    pub fn bus_time_us(bus: BusKind, modules: u8) -> u32 {
-        let per_module = match bus {
-            BusKind::Classic => 135 * (1 + FRAGMENTS as u32),
-            BusKind::Fd => 56 + 169,
+    /// About how long SYNC, `points` GOAL frames and the STATE and LATENT frames of all modules occupy the bus in one cycle, with
+    /// worst-case bit stuffing at 1 Mbit/s and 5 Mbit/s. If this exceeds the period, the modules farthest from the head are never
+    /// heard.
+    pub fn bus_time_us(bus: BusKind, modules: u8, points: u8) -> u32 {
+        let (short, latent) = match bus {
+            BusKind::Classic => (135, 135 * FRAGMENTS as u32),
+            BusKind::Fd => (56, 169),
         };
-        u32::from(modules) * per_module + 270
+        u32::from(modules) * (short + latent) + (1 + u32::from(points)) * short
     }
 }
 
@@ -299,15 +303,44 @@ struct Outbox {
     heartbeat: Option<Heartbeat>,
 }
 
+/// What is remembered of one point of the scene.
 #[derive(Clone, Copy, Debug, Default)]
-struct GoalMemory {
+struct PointMemory {
+    /// Its number, if the task has such a point.
+    number: Option<u8>,
     position: Option<[f32; 3]>,
     /// Cycles since it was told; saturating.
     age: u8,
-    /// Cycles since the station was heard.
-    silent: u8,
     /// That of the next cycle, told before its SYNC came.
     next: Option<Goal>,
+}
+
+impl PointMemory {
+    /// A cycle starts, with these lower bits of its number; `follows` if it is the next one after the last.
+    fn start(&mut self, low: u8, follows: bool, memory: u8) {
+        self.age = self.age.saturating_add(1);
+        if let Some(goal) = self.next.take().filter(|goal| follows && goal.cycle == low) {
+            self.position = goal.position();
+            self.age = 0;
+        }
+        if self.age > memory {
+            self.position = None;
+        }
+    }
+
+    /// A point of cycle `low - age` was told.
+    fn hear(&mut self, goal: Goal, age: u8, memory: u8) -> Heard {
+        if age == u8::MAX {
+            self.next = Some(goal);
+            Heard::Next
+        } else if age <= self.age && age <= memory {
+            self.position = goal.position();
+            self.age = age;
+            Heard::Now
+        } else {
+            Heard::Stale
+        }
+    }
 }
 
 /// The controller of one module.
@@ -341,7 +374,9 @@ pub struct Controller<'a> {
     phase: Phase,
     sample: Sensors,
     encoded: Option<Encoded>,
-    goal: GoalMemory,
+    points: [PointMemory; POINTS],
+    /// Cycles since the station was heard; saturating.
+    station_silent: u8,
     last_heard: Micros,
     last_act: Option<Micros>,
 
@@ -386,7 +421,11 @@ impl<'a> Controller<'a> {
             phase: Phase::Done,
             sample: Sensors::ZERO,
             encoded: None,
-            goal: GoalMemory::default(),
+            points: policy
+                .task()
+                .observed(config.node, config.modules)
+                .map(|number| PointMemory { number, ..PointMemory::default() }),
+            station_silent: 0,
             last_heard: now,
             last_act: None,
             torque: [0.0; AXES],
@@ -682,21 +721,15 @@ impl<'a> Controller<'a> {
     }
 
     fn hear_goal(&mut self, goal: Goal) -> Heard {
-        self.goal.silent = 0;
+        self.station_silent = 0;
         if self.cycle_start.is_none() {
             return Heard::Stale;
         }
         let age = (self.cycle as u8).wrapping_sub(goal.cycle);
-        if age == u8::MAX {
-            self.goal.next = Some(goal);
-            Heard::Next
-        } else if age <= self.goal.age && age <= self.config.timing.goal_memory {
-            self.goal.position = goal.position();
-            self.goal.age = age;
-            Heard::Now
-        } else {
-            Heard::Stale
-        }
+        let memory = self.config.timing.goal_memory;
+        let point = self.points.iter_mut().find(|point| point.number == Some(goal.point()));
+        // Other modules' points say no more than that the station is there.
+        point.map_or(Heard::Now, |point| point.hear(goal, age, memory))
     }
 
     // Keeping time
@@ -784,14 +817,9 @@ impl<'a> Controller<'a> {
         self.failsafe.set(Fault::PolicyMismatch, self.neighbours.mismatch() != 0);
         up(&mut self.stats.cycles);
 
-        self.goal.age = self.goal.age.saturating_add(1);
-        self.goal.silent = self.goal.silent.saturating_add(1);
-        if let Some(goal) = self.goal.next.take().filter(|goal| follows && goal.cycle == low) {
-            self.goal.position = goal.position();
-            self.goal.age = 0;
-        }
-        if self.goal.age > self.config.timing.goal_memory {
-            self.goal.position = None;
+        self.station_silent = self.station_silent.saturating_add(1);
+        for point in &mut self.points {
+            point.start(low, follows, self.config.timing.goal_memory);
         }
 
         // Somebody who follows another though nobody nearer the head lives will keep the time soon.
@@ -817,13 +845,19 @@ impl<'a> Controller<'a> {
         self.policy.goal_known_to() == GoalKnownTo::All || self.config.node == 0
     }
 
+    /// Whether the station still has to tell a point of this cycle, and can be expected to.
+    fn points_due(&self) -> bool {
+        self.uses_goal()
+            && self.station_silent <= self.config.timing.goal_memory
+            && self.points.iter().any(|point| point.number.is_some() && point.age > 0)
+    }
+
     fn advance(&mut self) {
         let Some(start) = self.cycle_start else { return };
         let since = self.now.saturating_sub(start);
         let timing = self.config.timing;
         if self.phase == Phase::States {
-            let goal_due = self.uses_goal() && self.goal.silent <= timing.goal_memory && self.goal.age > 0;
-            let complete = self.neighbours.missing_states() == 0 && !goal_due;
+            let complete = self.neighbours.missing_states() == 0 && !self.points_due();
             if complete || since >= u64::from(timing.state_deadline_us) {
                 self.observe();
             }
@@ -853,9 +887,13 @@ impl<'a> Controller<'a> {
             }
         }
         let head = self.chain.head_seen_from(self.own());
-        let goal = self.goal.position.filter(|_| self.uses_goal()).map(Vector3::from);
+        let uses_goal = self.uses_goal();
+        let told = Told {
+            points: self.points.map(|point| point.position.filter(|_| uses_goal).map(Vector3::from)),
+            seeker: self.policy.task().seeker(),
+        };
         let place = place(self.own(), usize::from(self.config.modules));
-        let encoded = self.policy.encode(&observe(&self.sample, place, &head, goal));
+        let encoded = self.policy.encode(&observe(&self.sample, place, &head, &told));
         if self.policy.attention() && !self.quiet {
             self.outbox.pieces_sent = 0;
             self.outbox.latent = Some(LatentMessage {

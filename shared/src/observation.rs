@@ -6,9 +6,9 @@
 //!
 //! | index | field | unit | frame | scale |
 //! |---|---|---|---|---|
-//! | 0..3 | vector to the goal | robot units | own | / 10, clipped to +-2 |
+//! | 0..3 | vector to the first point, the goal | robot units | own | / 10, clipped to +-2 |
 //! | 3..6 | direction to the goal | - | own | unit vector |
-//! | 6 | ln(1 + distance to the goal) | ln(robot units) | - | 1 |
+//! | 6 | ln(1 + distance of the [`Seeker`] to the goal) | ln(robot units) | - | 1 |
 //! | 7 | the goal is known | - | - | 0 or 1; if 0, fields 0..7 are 0 |
 //! | 8..11 | up (against gravity) | - | own | unit vector |
 //! | 11..14 | angular rate | rad/s | own | / 5 |
@@ -17,9 +17,16 @@
 //! | 22..24 | measured torque, yaw and pitch | of the limit | axis | 1 |
 //! | 24..27 | vector to the head link | robot units | own | / 10, clipped to +-2 |
 //! | 27 | place in the chain | - | - | 0 head .. 1 tail |
+//! | 28..31 | vector to the second point | robot units | own | / 10, clipped to +-2 |
+//! | 31..34 | direction to the second point | - | own | unit vector |
+//! | 34 | ln(1 + distance of the head to the second point) | ln(robot units) | - | 1 |
+//! | 35 | the second point is known | - | - | 0 or 1; if 0, fields 28..35 are 0 |
+//! | 36..39 | vector to the third point | robot units | own | / 10, clipped to +-2 |
+//! | 39 | the third point is known | - | - | 0 or 1; if 0, fields 36..39 are 0 |
 //!
-//! "Own" is the frame of the module's second link ([`crate::robot::Geometry::OWN_LINK`]); distances of the goal are measured
-//! from the centre of the head link.
+//! "Own" is the frame of the module's second link ([`crate::robot::Geometry::OWN_LINK`]); distances are measured from the centre of the
+//! head link, or, if every module seeks a place of its own, from the origin of the own frame. What the three points are is the
+//! task's matter ([`crate::policy::Task::observed`]); they arrive in GOAL frames.
 
 use nalgebra::Vector3;
 
@@ -27,7 +34,10 @@ use crate::kinematics::Pose;
 use crate::robot::{AXES, MAX_JOINTS};
 
 /// Numbers in an observation.
-pub const SIZE: usize = 28;
+pub const SIZE: usize = 40;
+
+/// Points of the scene that a module observes at most.
+pub const POINTS: usize = 3;
 
 /// One observation, raw: not yet normalised by the policy's statistics.
 pub type Observation = [f32; SIZE];
@@ -62,7 +72,45 @@ pub const NAMES: [&str; SIZE] = [
     "head_y",
     "head_z",
     "place",
+    "second_x",
+    "second_y",
+    "second_z",
+    "second_direction_x",
+    "second_direction_y",
+    "second_direction_z",
+    "second_log_distance",
+    "second_known",
+    "third_x",
+    "third_y",
+    "third_z",
+    "third_known",
 ];
+
+/// Who is to come to the goal.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Seeker {
+    /// The head.
+    #[default]
+    Head,
+    /// Each module, to a goal of its own.
+    Each,
+}
+
+/// What a module is told of the scene, by GOAL frames.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Told {
+    /// The goal and up to two more points, robot units, frame of the head link.
+    pub points: [Option<Vector3<f32>>; POINTS],
+    /// Who is to come to the first of them.
+    pub seeker: Seeker,
+}
+
+impl Told {
+    /// A goal for the head, and no other point.
+    pub fn goal(goal: Vector3<f32>) -> Self {
+        Told { points: [Some(goal), None, None], seeker: Seeker::Head }
+    }
+}
 
 /// One sample of a module's own sensors.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -101,28 +149,54 @@ impl Sensors {
     }
 }
 
+/// Vector to a point (/ 10, clipped), direction to it, ln(1 + `distance`), and that it is known.
+fn point_fields(o: &mut [f32; 8], here: Vector3<f32>, distance: f32) {
+    let from_here = norm(here).max(1e-3);
+    for axis in 0..3 {
+        o[axis] = (here[axis] / 10.0).clamp(-2.0, 2.0);
+        o[3 + axis] = here[axis] / from_here;
+    }
+    o[6] = libm::logf(1.0 + distance);
+    o[7] = 1.0;
+}
+
+fn norm(v: Vector3<f32>) -> f32 {
+    libm::sqrtf(v.dot(&v))
+}
+
 /// Builds the observation of a module.
 ///
 /// `place` is 0 at the head and 1 at the tail; `head` the pose of the head link in the own frame
-/// ([`crate::kinematics::Chain::head_seen_from`]); `goal` the goal in the frame of the head link (robot units), if this module is told.
+/// ([`crate::kinematics::Chain::head_seen_from`]); `told` what this module is told of the scene.
 ///
 /// A module whose sensors are not [plausible](Sensors::plausible) observes nothing: all zeros, the paper's observation fault.
-pub fn observe(sensors: &Sensors, place: f32, head: &Pose, goal: Option<Vector3<f32>>) -> Observation {
+pub fn observe(sensors: &Sensors, place: f32, head: &Pose, told: &Told) -> Observation {
     let mut o = [0.0; SIZE];
     if !sensors.plausible() {
         return o;
     }
+    let [goal, second, third] = told.points;
     if let Some(goal) = goal {
-        let to_goal = head.point(goal);
-        // The distance counts from the head, the direction from here.
-        let distance = libm::sqrtf(goal.dot(&goal));
-        let from_here = libm::sqrtf(to_goal.dot(&to_goal)).max(1e-3);
-        for axis in 0..3 {
-            o[axis] = (to_goal[axis] / 10.0).clamp(-2.0, 2.0);
-            o[3 + axis] = to_goal[axis] / from_here;
+        let here = head.point(goal);
+        let distance = match told.seeker {
+            Seeker::Head => norm(goal),
+            Seeker::Each => norm(here),
+        };
+        if let Some(fields) = o.first_chunk_mut() {
+            point_fields(fields, here, distance);
         }
-        o[6] = libm::logf(1.0 + distance);
-        o[7] = 1.0;
+    }
+    if let Some(second) = second
+        && let Some(fields) = o.get_mut(28..).and_then(|o| o.first_chunk_mut())
+    {
+        point_fields(fields, head.point(second), norm(second));
+    }
+    if let Some(third) = third {
+        let here = head.point(third);
+        for axis in 0..3 {
+            o[36 + axis] = (here[axis] / 10.0).clamp(-2.0, 2.0);
+        }
+        o[39] = 1.0;
     }
     for axis in 0..3 {
         o[8 + axis] = sensors.up[axis];
@@ -157,7 +231,7 @@ mod tests {
     #[test]
     fn the_goal_arrives_in_the_own_frame() {
         let chain = Chain::new(Geometry::default());
-        let o = observe(&level(), place(1, 8), &chain.head_seen_from(1), Some(Vector3::new(0.0, 5.0, 0.0)));
+        let o = observe(&level(), place(1, 8), &chain.head_seen_from(1), &Told::goal(Vector3::new(0.0, 5.0, 0.0)));
         // Module 1's second link is 2.5 units behind the head.
         assert!((o[0] - 0.25).abs() < 1e-6 && (o[1] - 0.5).abs() < 1e-6);
         let direction: f32 = o[3..6].iter().map(|v| v * v).sum();
@@ -168,14 +242,30 @@ mod tests {
     }
 
     #[test]
+    fn three_points_arrive_and_distances_are_those_of_the_seeker() {
+        let chain = Chain::new(Geometry::default());
+        let points = [(3.0, 4.0), (0.0, -2.0), (-30.0, 1.0)].map(|(x, y)| Some(Vector3::new(x, y, 0.0)));
+        let head = chain.head_seen_from(1);
+        let by_head = observe(&level(), 0.0, &head, &Told { points, seeker: Seeker::Head });
+        let each = observe(&level(), 0.0, &head, &Told { points, seeker: Seeker::Each });
+        assert!((by_head[6] - libm::logf(6.0)).abs() < 1e-6);
+        // 2.5 units behind the head it is 5.5 along and 4 aside.
+        assert!((each[6] - libm::logf(1.0 + libm::hypotf(5.5, 4.0))).abs() < 1e-6);
+        assert!(by_head[..6] == each[..6] && by_head[7..] == each[7..]);
+        assert!((each[28] - 0.25).abs() < 1e-6 && (each[29] + 0.2).abs() < 1e-6 && each[35] == 1.0);
+        assert!((each[34] - libm::logf(3.0)).abs() < 1e-6 && (each[32] / each[31] + 0.8).abs() < 1e-5);
+        assert!(each[36] == -2.0 && (each[37] - 0.1).abs() < 1e-6 && each[39] == 1.0);
+    }
+
+    #[test]
     fn an_unknown_goal_is_all_zero_and_implausible_sensors_observe_nothing() {
         let chain = Chain::new(Geometry::default());
         let mut sensors = level();
         assert!(sensors.plausible());
-        let o = observe(&sensors, 0.0, &chain.head_seen_from(0), None);
-        assert!(o[..8].iter().all(|v| *v == 0.0) && o[10] == 1.0);
+        let o = observe(&sensors, 0.0, &chain.head_seen_from(0), &Told::default());
+        assert!(o[..8].iter().chain(&o[28..]).all(|v| *v == 0.0) && o[10] == 1.0);
         sensors.angular_rate[1] = f32::NAN;
         assert!(!sensors.plausible() && !Sensors::ZERO.plausible());
-        assert_eq!(observe(&sensors, 0.5, &chain.head_seen_from(0), None), [0.0; SIZE]);
+        assert_eq!(observe(&sensors, 0.5, &chain.head_seen_from(0), &Told::default()), [0.0; SIZE]);
     }
 }

@@ -17,11 +17,11 @@ use core::fmt;
 use crc::{CRC_32_ISO_HDLC, Crc};
 
 use crate::nn::{self, Dense};
-use crate::observation::{self, Observation};
+use crate::observation::{self, Observation, POINTS, Seeker};
 use crate::robot::{AXES, Geometry, Limits, MAX_JOINTS, MAX_MODULES};
 
 /// Version of the layout that this code reads and writes.
-pub const VERSION: u16 = 1;
+pub const VERSION: u16 = 2;
 /// The first bytes of every image.
 pub const MAGIC: [u8; 8] = *b"COMPOSER";
 
@@ -79,6 +79,44 @@ impl Task {
     /// The task of that name.
     pub fn from_name(name: &str) -> Option<Self> {
         Task::ALL.into_iter().find(|task| task.name() == name)
+    }
+
+    /// Points of the scene that the station tells a robot of `modules` modules in each cycle.
+    pub const fn points(self, modules: u8) -> u8 {
+        match self {
+            Task::GoalReaching => 1,
+            Task::BlockPushing => 2,
+            Task::ShapeFormation => modules,
+            Task::TubeCrossing | Task::WallClimbing => 3,
+        }
+    }
+
+    /// Which points module `module` of `modules` observes as its first, second and third.
+    ///
+    /// | task | first, the goal | second | third |
+    /// |---|---|---|---|
+    /// | goal-reaching | 0, the goal | | |
+    /// | block-pushing | 0, the goal of the block | 1, the block's centre | |
+    /// | shape-formation | its own target | the target of the next module towards the head | towards the tail |
+    /// | tube-crossing | 0, the goal behind the exit | 1, the entrance's centre | 2, the middle of the tube |
+    /// | wall-climbing | 0, the goal behind the wall | 1, the foot of the wall's near face, nearest to the head | 2, the top above it |
+    pub const fn observed(self, module: u8, modules: u8) -> [Option<u8>; POINTS] {
+        match self {
+            Task::GoalReaching => [Some(0), None, None],
+            Task::BlockPushing => [Some(0), Some(1), None],
+            Task::ShapeFormation => {
+                [Some(module), module.checked_sub(1), if module + 1 < modules { Some(module + 1) } else { None }]
+            }
+            Task::TubeCrossing | Task::WallClimbing => [Some(0), Some(1), Some(2)],
+        }
+    }
+
+    /// Who is to come to the goal.
+    pub const fn seeker(self) -> Seeker {
+        match self {
+            Task::ShapeFormation => Seeker::Each,
+            _ => Seeker::Head,
+        }
     }
 
     fn from_number(number: u8) -> Option<Self> {
@@ -942,8 +980,8 @@ mod tests {
 
     #[test]
     fn the_layout_is_the_documented_one() {
-        assert_eq!(Layer::ALL.map(Layer::offset), [296, 2604, 3696, 4788, 6968, 11580, 13888]);
-        assert_eq!((IMAGE_SIZE, MEAN_AT, SOFTMAX_AT, CRC_AT), (14040, 64, 288, 14036));
+        assert_eq!(Layer::ALL.map(Layer::offset), [392, 3468, 4560, 5652, 7832, 12444, 14752]);
+        assert_eq!((IMAGE_SIZE, MEAN_AT, SOFTMAX_AT, CRC_AT), (14904, 64, 384, 14900));
         assert_eq!(CRC.checksum(b"123456789"), 0xcbf4_3926);
         let document = include_str!("../policy-format.md");
         for layer in Layer::ALL {
@@ -970,8 +1008,8 @@ mod tests {
             (LIMITS_AT, "f32 | torque limit"),
             (PERIOD_AT, "u32 | control period"),
             (RELAX_AT, "f32 | relaxation time"),
-            (MEAN_AT, "f32[28] | mean"),
-            (GAIN_AT, "f32[28] | gain"),
+            (MEAN_AT, "f32[40] | mean"),
+            (GAIN_AT, "f32[40] | gain"),
             (SOFTMAX_AT, "i32 | softmax multiplier"),
             (CRC_AT, "u32 | checksum"),
         ] {
@@ -1007,13 +1045,13 @@ mod tests {
         };
         assert_eq!(said(0, b"ELF"), "this is not a policy image: it does not begin with COMPOSER");
         assert_eq!(
-            said(VERSION_AT, &[2]),
-            "the policy image has layout version 2, this build reads version 1: export the policy again"
+            said(VERSION_AT, &[1]),
+            "the policy image has layout version 1, this build reads version 2: export the policy again"
         );
         assert!(
-            said(DIMENSIONS_AT + 2, &[128]).contains("dimensions [28, 128, 16, 32, 64, 2], this build runs [28, 64")
+            said(DIMENSIONS_AT + 2, &[128]).contains("dimensions [40, 128, 16, 32, 64, 2], this build runs [40, 64")
         );
-        assert_eq!(said(LENGTH_AT, &[0, 0]), "the policy image says it is 0 bytes long, layout version 1 is 14040");
+        assert_eq!(said(LENGTH_AT, &[0, 0]), "the policy image says it is 0 bytes long, layout version 2 is 14904");
         assert_eq!(said(TASK_AT, &[5]), "the policy image is for task 5, this build knows tasks 0 to 4");
         assert!(said(GOAL_KNOWN_TO_AT, &[2]).contains("2 in field `goal known to`"));
         assert!(said(ATTENTION_AT, &[2]).contains("`attention`"));
@@ -1029,8 +1067,8 @@ mod tests {
             (LIMITS_AT + 12, "joint speed limit"),
             (LIMITS_AT + 16, "temperature limit"),
             (RELAX_AT, "relaxation time"),
-            (MEAN_AT + 4 * 27, "input mean"),
-            (GAIN_AT + 4 * 27, "input gain"),
+            (MEAN_AT + 4 * 39, "input mean"),
+            (GAIN_AT + 4 * 39, "input gain"),
         ] {
             assert!(said(at, &nan).contains(field) && said(at, &infinite).contains(field), "{field}");
         }
@@ -1045,7 +1083,7 @@ mod tests {
             Policy::parse(&image[..]).unwrap_err().to_string().starts_with("the policy image is damaged: its CRC-32")
         );
         let cut = Policy::parse(&image[..9000]).unwrap_err().to_string();
-        assert_eq!(cut, "the policy image is cut short: it has 9000 bytes where 14040 are needed");
+        assert_eq!(cut, "the policy image is cut short: it has 9000 bytes where 14904 are needed");
         let long: Vec<u8> = image.iter().copied().chain([0]).collect();
         assert!(Policy::parse(&long).unwrap_err().to_string().contains("too long"));
     }
@@ -1076,6 +1114,25 @@ mod tests {
     }
 
     #[test]
+    fn every_point_that_a_module_observes_is_told() {
+        for task in Task::ALL {
+            for modules in [1, 2, 8, MAX_MODULES as u8] {
+                assert!(usize::from(task.points(modules)) <= crate::wire::GOAL_POINTS);
+                let mut seen = 0u64;
+                for module in 0..modules {
+                    let observed = task.observed(module, modules);
+                    assert!(observed[0].is_some());
+                    for point in observed.into_iter().flatten() {
+                        assert!(point < task.points(modules), "{task} {module} of {modules}");
+                        seen |= 1 << point;
+                    }
+                }
+                assert_eq!(seen.count_ones(), u32::from(task.points(modules)), "{task}");
+            }
+        }
+    }
+
+    #[test]
     fn names_round_trip() {
         for task in Task::ALL {
             assert_eq!(Task::from_name(task.name()), Some(task));
@@ -1098,7 +1155,7 @@ mod tests {
             attention.iter().for_each(|x| digest.update(&x.to_le_bytes()));
             action.iter().for_each(|x| digest.update(&x.to_bits().to_le_bytes()));
         }
-        assert_eq!((policy.crc(), digest.finalize()), (2_459_611_591, 3_204_140_105));
+        assert_eq!((policy.crc(), digest.finalize()), (3_933_058_065, 3_900_035_348));
     }
 
     #[test]

@@ -33,7 +33,7 @@ impl Plant for Still {
         Sensors { joint_angles: [0.01 * module as f32; 4], up: [0.0, 0.0, 1.0], temperature: 25.0, ..Sensors::ZERO }
     }
 
-    fn goal(&self) -> Option<[f32; 3]> {
+    fn point(&self, _: u8) -> Option<[f32; 3]> {
         Some([5.0, 3.0, 0.0])
     }
 

@@ -13,8 +13,9 @@ pub trait Plant {
     fn step_ns(&self) -> u64;
     /// What the sensors of `module` read now.
     fn sensors(&self, module: usize) -> Sensors;
-    /// The goal in the frame of the head link (robot units), as the ground station broadcasts it; none if there is no goal.
-    fn goal(&self) -> Option<[f32; 3]>;
+    /// A point of the scene in the frame of the head link (robot units), as the ground station broadcasts it; none if it is not known.
+    /// Point 0 is the goal, see [`composer_shared::policy::Task::observed`].
+    fn point(&self, number: u8) -> Option<[f32; 3]>;
     /// Sets the torques of `module` (yaw, pitch); they act from the next step on, until set again.
     fn set_torque(&mut self, module: usize, torque: [f32; AXES]);
     /// Advances by [`Plant::step_ns`].

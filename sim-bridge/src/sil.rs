@@ -315,6 +315,8 @@ struct Engine<'a, 'c> {
     policy: Policy<'a>,
     bus: Bus,
     station: Station,
+    /// GOAL frames of this cycle that wait for a mailbox.
+    telling: VecDeque<Frame>,
     station_node: usize,
     modules: Vec<Module<'a>>,
     /// What starts (`true`) and ends, in order of time; `next_change` is the first that has not.
@@ -395,7 +397,8 @@ impl<'a, 'c> Engine<'a, 'c> {
             config,
             policy,
             bus: Bus::new(bus_config, nodes, config.seed),
-            station: Station::new(config.bus == BusKind::Fd),
+            station: Station::new(config.bus == BusKind::Fd, policy.task().points(count as u8)),
+            telling: VecDeque::new(),
             station_node: config.station_behind.min(count),
             modules: Vec::with_capacity(count),
             changes,
@@ -636,7 +639,9 @@ impl<'a, 'c> Engine<'a, 'c> {
                 if !late {
                     // A mailbox is free again.
                     for node in bus::nodes(*transmitters) {
-                        if let Some(module) = self.module(node) {
+                        if node == self.station_node {
+                            self.tell(*at_ns);
+                        } else if let Some(module) = self.module(node) {
                             self.pump(module, *at_ns);
                         }
                     }
@@ -656,10 +661,20 @@ impl<'a, 'c> Engine<'a, 'c> {
         if frame.function() != Some(Function::Sync) {
             return;
         }
-        if let Some(answer) = self.station.receive(frame, plant.goal()) {
-            self.bus.cancel(self.station_node, |waiting| waiting.id == answer.id);
-            let ready = now + u64::from(self.config.station_latency_us) * 1000;
-            let _ = self.bus.send(self.station_node, &answer, ready);
+        if let Some(frames) = self.station.receive(frame, |number| plant.point(number)) {
+            // What was still to be told of the last cycle is out of date.
+            self.bus.cancel(self.station_node, |waiting| waiting.function() == Some(Function::Goal));
+            self.telling = frames;
+            self.tell(now + u64::from(self.config.station_latency_us) * 1000);
+        }
+    }
+
+    /// Hands the station's GOAL frames to its CAN port, as many as fit.
+    fn tell(&mut self, ready: u64) {
+        while self.bus.has_room(self.station_node)
+            && let Some(frame) = self.telling.pop_front()
+        {
+            let _ = self.bus.send(self.station_node, &frame, ready);
         }
     }
 
@@ -853,7 +868,7 @@ mod tests {
             }
         }
 
-        fn goal(&self) -> Option<[f32; 3]> {
+        fn point(&self, _: u8) -> Option<[f32; 3]> {
             Some([5.0, 3.0 - 0.01 * self.history.len() as f32, 0.0])
         }
 

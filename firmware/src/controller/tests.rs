@@ -6,7 +6,7 @@ use std::string::ToString;
 use std::vec;
 use std::vec::Vec;
 
-use composer_shared::policy::{IMAGE_SIZE, random_image};
+use composer_shared::policy::{IMAGE_SIZE, Task, random_image};
 use composer_shared::wire::Function;
 use proptest::prelude::*;
 
@@ -36,6 +36,15 @@ fn goal_known_to_head() -> Policy<'static> {
 
 fn without_attention() -> Policy<'static> {
     policy(1, &[(28, 0)])
+}
+
+fn of_task(task: Task) -> Policy<'static> {
+    policy(7, &[(10, task as u8)])
+}
+
+/// Where a test puts the point of this number.
+fn shifted(goal: [f32; 3], point: u8) -> [f32; 3] {
+    [goal[0], goal[1] - 1.5 * f32::from(point), goal[2]]
 }
 
 fn level() -> Sensors {
@@ -159,8 +168,10 @@ impl Net {
                 && part == 0
                 && let Ok(Message::Sync(sync)) = Message::parse(&frame)
             {
-                let goal = Message::Goal(Goal::new(sync.cycle as u8, self.goal));
-                self.injected.push_back((0, goal.emit(STATION, self.bus == BusKind::Fd)));
+                for point in 0..self.policy.task().points(self.nodes.len() as u8) {
+                    let goal = Message::Goal(Goal::new(sync.cycle as u8, point, self.goal.map(|g| shifted(g, point))));
+                    self.injected.push_back((0, goal.emit(STATION, self.bus == BusKind::Fd)));
+                }
             }
         }
     }
@@ -236,9 +247,13 @@ fn eight_modules_agree_from_power_up() {
 
 #[test]
 fn the_torques_are_those_of_the_training_loop_to_the_last_bit() {
-    for (bus, policy) in
-        [(BusKind::Fd, policy(7, &[])), (BusKind::Classic, policy(7, &[])), (BusKind::Fd, without_attention())]
-    {
+    for (bus, policy) in [
+        (BusKind::Fd, policy(7, &[])),
+        (BusKind::Classic, policy(7, &[])),
+        (BusKind::Fd, without_attention()),
+        (BusKind::Fd, of_task(Task::ShapeFormation)),
+        (BusKind::Classic, of_task(Task::TubeCrossing)),
+    ] {
         let mut net = Net::new(5, bus, policy);
         let mut chain = Chain::new(policy.geometry());
         let mut torques = [[0.0f32; 2]; 5];
@@ -266,9 +281,11 @@ fn the_torques_are_those_of_the_training_loop_to_the_last_bit() {
                     false => chain.miss(i, relax),
                 }
             }
-            let goal = Goal::new(0, net.goal).position().map(Vector3::from);
+            let point = |p: u8| Goal::new(0, p, net.goal.map(|g| shifted(g, p))).position().map(Vector3::from);
             let encoded: [Encoded; 5] = core::array::from_fn(|i| {
-                policy.encode(&observe(&net.sensors[i], place(i, 5), &chain.head_seen_from(i), goal))
+                let points = policy.task().observed(i as u8, 5).map(|number| number.and_then(point));
+                let told = Told { points, seeker: policy.task().seeker() };
+                policy.encode(&observe(&net.sensors[i], place(i, 5), &chain.head_seen_from(i), &told))
             });
             let mut latents = [Default::default(); MAX_MODULES];
             let mut plausible = 0;
@@ -454,7 +471,7 @@ fn without_any_sync_the_motors_relax_and_a_sync_brings_them_back() {
     let mut module = Controller::new(config, policy, 0).unwrap();
     let mut now = 0;
     let sync = |cycle| Message::Sync(Sync::new(cycle, 8)).emit(0, true);
-    let goal = Message::Goal(Goal::new(0, None)).emit(STATION, true);
+    let goal = Message::Goal(Goal::new(0, 0, None)).emit(STATION, true);
     module.poll(now, &level(), Some(&sync(1)), BusStatus::ErrorActive);
     let mut relaxed_at = None;
     while now < 10 * PERIOD {
@@ -632,17 +649,17 @@ fn a_goal_holds_for_four_cycles() {
     for _ in 0..8 {
         net.run(PERIOD);
         let age = net.at(2).cycle() - start;
-        assert_eq!(net.at(2).goal.position.is_some(), age <= 4, "after {age} cycles");
+        assert_eq!(net.at(2).points[0].position.is_some(), age <= 4, "after {age} cycles");
     }
     // Nobody waits for a station that is silent: all act at once again.
     assert_eq!(net.at(2).stats().latent_age_us, 0);
     net.station = true;
     net.run(2 * PERIOD);
-    assert_eq!(net.at(2).goal.position, Some([3.0, 1.0, 0.0]));
+    assert_eq!(net.at(2).points[0].position, Some([3.0, 1.0, 0.0]));
     // The station knows that there is none.
     net.goal = None;
     net.run(2 * PERIOD);
-    assert_eq!(net.at(2).goal.position, None);
+    assert_eq!(net.at(2).points[0].position, None);
 }
 
 #[test]
@@ -658,6 +675,22 @@ fn a_goal_for_the_head_alone_moves_the_others_only_through_attention() {
     assert!(a.0 != b.0 && a.1 == b.1);
     let (a, b) = (torques(policy(1, &[]), near), torques(policy(1, &[]), far));
     assert!(a.0 != b.0 && a.1 != b.1);
+}
+
+#[test]
+fn a_module_keeps_the_points_of_its_task_and_waits_for_them() {
+    let mut net = Net::new(4, BusKind::Fd, of_task(Task::ShapeFormation));
+    net.run(SECOND);
+    let at = |p| Some(shifted([3.0, 1.0, 0.0], p));
+    assert_eq!(net.at(0).points.map(|p| p.position), [at(0), None, at(1)]);
+    assert_eq!(net.at(2).points.map(|p| p.position), [at(2), at(1), at(3)]);
+    assert_eq!(net.at(3).points.map(|p| p.position), [at(3), at(2), None]);
+    // The station tells it no more about point 2: it acts at the state deadline on what it has, and forgets the point in the end.
+    net.loss = Box::new(|_, frame, _| matches!(Message::parse(frame), Ok(Message::Goal(goal)) if goal.point() == 2));
+    net.run(SECOND);
+    assert_eq!(net.at(2).points.map(|p| p.position), [None, at(1), at(3)]);
+    assert_eq!(net.at(0).points.map(|p| p.position), [at(0), None, at(1)]);
+    assert!(net.at(2).stats().acted > 30 && net.at(0).stats().acted > 30);
 }
 
 // Failing safe
@@ -832,7 +865,7 @@ fn deadlines_leave_room_for_the_bus() {
     let policy = policy(1, &[]);
     for (bus, modules) in [(BusKind::Fd, 8), (BusKind::Fd, 64), (BusKind::Classic, 8), (BusKind::Classic, 16)] {
         let timing = Timing::for_policy(&policy, bus, modules);
-        assert!(timing.collect_deadline_us > Timing::bus_time_us(bus, modules) * 3 / 2, "{bus:?} {modules}");
+        assert!(timing.collect_deadline_us > Timing::bus_time_us(bus, modules, 1) * 3 / 2, "{bus:?} {modules}");
         assert!(timing.collect_deadline_us <= 40_000);
         assert!(Config::new(0, modules, bus, &policy).check().is_ok());
     }

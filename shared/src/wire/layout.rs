@@ -96,7 +96,7 @@ pub const LAYOUTS: [Layout; 8] = [
         fields: &[
             unsigned("cycle", 8),
             unsigned("known", 1),
-            unsigned("reserved", 7),
+            unsigned("point", 7),
             signed("position", 3, 16, 0.00390625, "unit"),
         ],
     },

@@ -117,12 +117,15 @@ impl Sync {
     }
 }
 
-/// GOAL: where the goal is, in the frame of the head link.
+/// Points that GOAL frames can tell in one cycle.
+pub const GOAL_POINTS: usize = 128;
+
+/// GOAL: where the goal is, or another point of the scene, in the frame of the head link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Goal {
     /// Lower 8 bits of the cycle it belongs to.
     pub cycle: u8,
-    /// Bit 0: there is a goal. The others are reserved and zero.
+    /// Bit 0: the point is known. Bits 1 to 7: which point it is.
     flags: u8,
     /// Position in the frame of the head link, in steps of [`GOAL_LSB`].
     #[serde(with = "le_i16_3")]
@@ -130,17 +133,23 @@ pub struct Goal {
 }
 
 impl Goal {
-    /// A goal at `position` (robot units, frame of the head link), or none. Held within +-128 units; a position that is not
-    /// finite is no goal.
-    pub fn new(cycle: u8, position: Option<[f32; 3]>) -> Self {
+    /// Point number `point` (its lower 7 bits; [`crate::policy::Task::observed`] says what they mean, 0 is the goal) at `position`
+    /// (robot units, frame of the head link), or not known. Held within +-128 units; a position that is not finite is not known.
+    pub fn new(cycle: u8, point: u8, position: Option<[f32; 3]>) -> Self {
+        let which = point << 1;
         match position.filter(|p| p.iter().all(|x| x.is_finite())) {
             // `as` saturates.
-            Some(p) => Goal { cycle, flags: 1, steps: p.map(|x| libm::roundf(x / GOAL_LSB) as i16) },
-            None => Goal { cycle, flags: 0, steps: [0; 3] },
+            Some(p) => Goal { cycle, flags: which | 1, steps: p.map(|x| libm::roundf(x / GOAL_LSB) as i16) },
+            None => Goal { cycle, flags: which, steps: [0; 3] },
         }
     }
 
-    /// Where the goal is (robot units, frame of the head link), if there is one.
+    /// Which point of the scene it is.
+    pub const fn point(&self) -> u8 {
+        self.flags >> 1
+    }
+
+    /// Where it is (robot units, frame of the head link), if that is known.
     pub fn position(&self) -> Option<[f32; 3]> {
         (self.flags & 1 != 0).then(|| self.steps.map(|s| f32::from(s) * GOAL_LSB))
     }
@@ -468,9 +477,7 @@ impl Message {
                 Message::Sync(m)
             }
             Function::Goal => {
-                let m: Goal = decode(function, body)?;
-                reserved(m.flags & !1)?;
-                Message::Goal(m)
+                Message::Goal(decode(function, body)?)
             }
             Function::State => {
                 let m: State = decode(function, body)?;

@@ -19,7 +19,7 @@ mod message;
 pub use frame::{Frame, Function, STATION, WireError};
 pub use layout::{Field, LAYOUTS, Layout, Senders, dbc};
 pub use message::{
-    ANGLE_LSB, EmergencyStop, FRAGMENTS, Fault, Fragment, GOAL_LSB, Goal, Health, Heartbeat, LATENT_SIZE,
+    ANGLE_LSB, EmergencyStop, FRAGMENTS, Fault, Fragment, GOAL_LSB, GOAL_POINTS, Goal, Health, Heartbeat, LATENT_SIZE,
     LatentMessage, LimitedBy, Message, Mode, NOBODY, State, StopCommand, Sync, Telemetry, quantise_angle,
 };
 

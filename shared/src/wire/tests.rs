@@ -31,7 +31,7 @@ fn examples() -> Vec<(Message, u8, &'static str)> {
         (Message::EmergencyStop(EmergencyStop::new(StopCommand::Stop, 0)), 3, "003#0100"),
         (Message::EmergencyStop(EmergencyStop::new(StopCommand::Release, 0)), STATION, "07F#0200"),
         (Message::Sync(Sync::new(0x1234, 8)), 0, "080#34120800"),
-        (Message::Goal(Goal::new(0x34, Some([0.5, 1.5, -0.25]))), STATION, "17F#340180008001C0FF"),
+        (Message::Goal(Goal::new(0x34, 2, Some([0.5, 1.5, -0.25]))), STATION, "17F#340580008001C0FF"),
         (
             Message::State(State::new(0x34, Health(3), &[lsb, -lsb, -2048.0 * lsb, -16.0 * lsb])),
             3,
@@ -117,9 +117,9 @@ fn angles_survive_within_half_a_step() {
 
 #[test]
 fn goals_are_held_within_their_range() {
-    assert_eq!(Goal::new(1, Some([1000.0, -1000.0, 0.001])).position(), Some([32767.0 / 256.0, -128.0, 0.0]));
-    assert_eq!(Goal::new(1, Some([f32::NAN, 0.0, 0.0])).position(), None);
-    assert_eq!(Goal::new(1, None).position(), None);
+    assert_eq!(Goal::new(1, 0, Some([1000.0, -1000.0, 0.001])).position(), Some([32767.0 / 256.0, -128.0, 0.0]));
+    assert_eq!(Goal::new(1, 0, Some([f32::NAN, 0.0, 0.0])).position(), None);
+    assert_eq!(Goal::new(1, 0, None).position(), None);
 }
 
 #[test]
@@ -136,7 +136,6 @@ fn whatever_is_not_exactly_right_is_refused_with_its_reason() {
         ("003#0200", WireError::WrongSender { function: Function::EmergencyStop, module: 3 }),
         ("003#0300", WireError::WrongValue { function: Function::EmergencyStop, field: "command", value: 3 }),
         ("080#00000001", WireError::ReservedBits(Function::Sync)),
-        ("17F#0002000000000000", WireError::ReservedBits(Function::Goal)),
         ("183#0010000000000000", WireError::ReservedBits(Function::State)),
         ("283#8000000000000000", WireError::ReservedBits(Function::LatentFragment)),
         ("403#0000000000004000", WireError::WrongValue { function: Function::Telemetry, field: "module", value: 64 }),
@@ -308,7 +307,7 @@ proptest! {
         for message in messages {
             prop_assert_eq!(Message::parse(&message.emit(module, fd)), Ok(message));
         }
-        let goal = Message::Goal(Goal::new(low, Some([x[0], x[1], x[2]])));
+        let goal = Message::Goal(Goal::new(low, (low & 0x7f) as u8, Some([x[0], x[1], x[2]])));
         prop_assert_eq!(Message::parse(&goal.emit(STATION, fd)), Ok(goal));
         prop_assert_eq!(LatentMessage::from_fragments(&latent.fragments().map(|f| f.data)), Ok(latent));
     }
