@@ -8,8 +8,8 @@ use std::sync::Arc;
 
 use composer_firmware::controller::relax_factor;
 use composer_shared::kinematics::Chain;
-use composer_shared::observation::{self, Sensors};
-use composer_shared::policy::GoalKnownTo;
+use composer_shared::observation::{self, POINTS, Sensors, Told};
+use composer_shared::policy::{GoalKnownTo, Task};
 use composer_shared::robot::Limits;
 use composer_shared::wire;
 use composer_sim_bridge::faults::{Fault, FaultKind, ScheduledFault};
@@ -21,7 +21,7 @@ use serde::{Deserialize, Serialize};
 use crate::environment::{Environment, Outcome, PRIVILEGED, View};
 use crate::robot::Robot;
 use crate::sim::{Motion, Snake};
-use crate::tasks::goal_reaching::GoalReaching;
+use crate::tasks::{Judge, Point, TaskConfig, Verdict};
 
 /// Faults that training draws for each episode.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -78,7 +78,7 @@ pub struct EnvConfig {
     /// The robot.
     pub robot: Robot,
     /// The task.
-    pub task: GoalReaching,
+    pub task: TaskConfig,
     /// Who is told the goal.
     pub goal_known_to: GoalKnownTo,
     /// Control period, s.
@@ -90,11 +90,11 @@ pub struct EnvConfig {
 }
 
 impl EnvConfig {
-    /// The default task on a robot: 0.05 s control period, a torque one physics step after the sample, no faults.
-    pub fn new(robot: Robot) -> Self {
+    /// A task with its default settings on a robot: 0.05 s control period, a torque one physics step after the sample, no faults.
+    pub fn new(task: Task, robot: Robot) -> Self {
         EnvConfig {
             robot,
-            task: GoalReaching::default(),
+            task: TaskConfig::new(task),
             goal_known_to: GoalKnownTo::All,
             control_period: 0.05,
             delay: [1, 1],
@@ -153,7 +153,7 @@ pub struct SnakeEnv {
     limits: Limits,
     relax: f32,
     snake: Snake,
-    goal: [f32; 3],
+    judge: Judge,
     faults: Vec<ScheduledFault>,
     now: FaultsNow,
     /// What the modules before and behind a cut believe of the chain; the same without a cut.
@@ -162,22 +162,19 @@ pub struct SnakeEnv {
     command: Vec<[f32; 2]>,
     heard: Vec<u64>,
     delay: usize,
-    steps: u32,
-    distance: f32,
     episode_return: f32,
-    low_steps: u32,
     rng: ChaCha8Rng,
 }
 
 impl SnakeEnv {
     /// An environment, reset with seed 0.
     pub fn new(config: Arc<EnvConfig>) -> Self {
-        let snake = Snake::new(&config.robot);
+        let (snake, judge) = Judge::start(&config.task, 0, &config.robot);
         let modules = config.robot.modules;
         let mut env = SnakeEnv {
             limits: config.robot.limits(),
             relax: relax_factor((config.control_period * 1e6).round() as u32, config.robot.relax_seconds()),
-            goal: [0.0; 3],
+            judge,
             faults: Vec::new(),
             now: FaultsNow::default(),
             chains: [Chain::new(config.robot.geometry()), Chain::new(config.robot.geometry())],
@@ -185,10 +182,7 @@ impl SnakeEnv {
             command: vec![[0.0; 2]; modules],
             heard: vec![0; modules],
             delay: 1,
-            steps: 0,
-            distance: 0.0,
             episode_return: 0.0,
-            low_steps: 0,
             rng: ChaCha8Rng::seed_from_u64(0),
             snake,
             config,
@@ -200,17 +194,13 @@ impl SnakeEnv {
     /// Starts an episode with given faults instead of drawn ones.
     pub fn reset_with(&mut self, seed: u64, faults: &[ScheduledFault]) {
         let config = self.config.clone();
-        self.snake = Snake::new(&config.robot);
-        self.goal = config.task.goal(seed, config.robot.link_radius);
+        (self.snake, self.judge) = Judge::start(&config.task, seed, &config.robot);
         self.rng = ChaCha8Rng::seed_from_u64(seed ^ 0x5eed_fa17);
         self.faults = faults.to_vec();
         self.delay = self.rng.random_range(config.delay[0]..=config.delay[1]).min(config.substeps() - 1);
         self.chains = [Chain::new(config.robot.geometry()), Chain::new(config.robot.geometry())];
         self.command.fill([0.0; 2]);
-        self.steps = 0;
         self.episode_return = 0.0;
-        self.low_steps = 0;
-        self.distance = self.snake.head_distance(self.goal);
         self.sample();
     }
 
@@ -218,7 +208,7 @@ impl SnakeEnv {
     fn sample(&mut self) {
         let modules = self.config.robot.modules;
         let period_ns = f64::from(self.config.control_period) * 1e9;
-        self.now = FaultsNow::at(&self.faults, (f64::from(self.steps) * period_ns).round() as u64);
+        self.now = FaultsNow::at(&self.faults, (f64::from(self.judge.steps()) * period_ns).round() as u64);
         let mut speaking = [0u64; 2];
         for module in 0..modules {
             let bit = 1u64 << module;
@@ -248,9 +238,9 @@ impl SnakeEnv {
         }
     }
 
-    /// The goal in the world.
-    pub fn goal(&self) -> [f32; 3] {
-        self.goal
+    /// The scene of the episode and what came of it so far.
+    pub fn judge(&self) -> &Judge {
+        &self.judge
     }
 
     /// The snake.
@@ -261,16 +251,6 @@ impl SnakeEnv {
     /// The faults at this moment.
     pub fn faults(&self) -> FaultsNow {
         self.now
-    }
-
-    /// Distance of the head to the goal now.
-    pub fn distance(&self) -> f32 {
-        self.distance
-    }
-
-    /// Control steps whose highest link centre stayed below two link diameters.
-    pub fn low_steps(&self) -> u32 {
-        self.low_steps
     }
 
     /// Extremes of the motion in this episode.
@@ -295,34 +275,47 @@ impl Environment for SnakeEnv {
         view.privileged.clear();
         view.acts.clear();
         view.heard.clone_from(&self.heard);
-        // As the GOAL frame rounds it.
-        let goal = wire::Goal::new(0, Some(self.snake.in_head_frame(self.goal))).position();
+        let task = self.config.task.task();
+        // As the GOAL frames round them.
+        let point = |number| {
+            let position = self.judge.point_from_head(&self.config.task, &self.snake, number);
+            wire::Goal::new(0, number, position).position()
+        };
+        let told: Vec<_> = (0..task.points(modules as u8)).map(point).collect();
+        let Verdict { distance, left, .. } = self.judge.verdict();
         for module in 0..modules {
             let side = self.now.side(module);
             let head = self.chains[side].head_seen_from(module);
-            // The station that tells the goal sits at the head's end of the cable.
-            let told = side == 0 && (self.config.goal_known_to == GoalKnownTo::All || module == 0);
+            // The station that tells the points sits at the head's end of the cable.
+            let hears = side == 0 && (self.config.goal_known_to == GoalKnownTo::All || module == 0);
+            let observed = task.observed(module as u8, modules as u8);
+            let mut points = [None; POINTS];
+            for (point, number) in points.iter_mut().zip(observed) {
+                *point = number.filter(|_| hears).and_then(|n| told[usize::from(n)]).map(Into::into);
+            }
             let place = observation::place(module, modules);
-            view.observations.push(observation::observe(
-                &self.sensors[module],
-                place,
-                &head,
-                goal.filter(|_| told).map(Into::into),
-            ));
+            let told = Told { points, seeker: task.seeker() };
+            view.observations.push(observation::observe(&self.sensors[module], place, &head, &told));
             let (velocity, height) = self.snake.privileged(module);
-            let true_goal = self.snake.in_own_frame(module, self.goal);
+            let true_point = |n: Option<u8>| -> Option<Point> {
+                let point = self.config.task.rules().point(self.judge.course(), &self.snake, n?)?;
+                Some(self.snake.in_own_frame(module, point))
+            };
+            let [goal, second, _] = observed.map(|n| true_point(n).unwrap_or_default());
             let hit = |set: u64| f32::from((set >> module & 1) as u8);
             let mut p = [0.0; PRIVILEGED];
             for axis in 0..3 {
                 p[axis] = velocity[axis] / 5.0;
-                p[3 + axis] = true_goal[axis] / 10.0;
+                p[3 + axis] = goal[axis] / 10.0;
+                p[12 + axis] = second[axis] / 10.0;
             }
             p[6] = height;
-            p[7] = libm::logf(1.0 + self.distance);
+            p[7] = libm::logf(1.0 + distance);
             p[8] = hit(self.now.gone);
             p[9] = hit(self.now.weak);
             p[10] = hit(self.now.blind);
             p[11] = self.delay as f32;
+            p[15] = left / 10.0;
             view.privileged.push(p);
             view.acts.push(self.now.gone >> module & 1 == 0);
         }
@@ -347,25 +340,20 @@ impl Environment for SnakeEnv {
                 }
             }
             self.snake.step();
+            self.judge.watch(&self.config.task, &self.snake);
         }
-        self.steps += 1;
-        let (height, radius) = (self.snake.height(), self.config.robot.link_radius);
-        if height < 4.0 * radius {
-            self.low_steps += 1;
-        }
-        let before = self.distance;
-        self.distance = self.snake.head_distance(self.goal);
-        let success = self.distance < self.config.task.success_distance;
-        let reward = self.config.task.reward(before, self.distance, success, height - 3.0 * radius);
+        let reward = self.judge.step(&self.config.task, &self.snake);
         self.episode_return += reward;
         self.sample();
+        let Verdict { success, distance, .. } = self.judge.verdict();
+        let steps = self.judge.steps();
         Outcome {
             reward,
             terminated: success,
-            truncated: !success && self.steps >= self.config.task.cap,
+            truncated: !success && steps >= self.config.task.settings.cap,
             success,
-            distance: self.distance,
-            steps: self.steps,
+            distance,
+            steps,
             episode_return: self.episode_return,
         }
     }
@@ -391,7 +379,8 @@ mod tests {
     #[test]
     fn the_same_seed_and_actions_give_the_same_bits_after_any_history() {
         let faults = FaultTraining { probability: 1.0, missed_latents: 0.1, ..FaultTraining::default() };
-        let config = Arc::new(EnvConfig { faults, delay: [1, 2], ..EnvConfig::new(Robot::default()) });
+        let config =
+            Arc::new(EnvConfig { faults, delay: [1, 2], ..EnvConfig::new(Task::GoalReaching, Robot::default()) });
         let mut fresh = SnakeEnv::new(config.clone());
         let mut used = SnakeEnv::new(config);
         drive(&mut used, 30);
@@ -402,7 +391,7 @@ mod tests {
 
     #[test]
     fn an_unplugged_module_falls_silent_and_slack_and_an_observation_fault_masks_the_key() {
-        let mut env = SnakeEnv::new(Arc::new(EnvConfig::new(Robot::default())));
+        let mut env = SnakeEnv::new(Arc::new(EnvConfig::new(Task::GoalReaching, Robot::default())));
         let scheduled = |at_ns, fault| ScheduledFault { at_ns, until_ns: None, fault };
         env.reset_with(1, &[scheduled(500_000_000, Fault::Unplug(3)), scheduled(0, Fault::SensorZeroed(5))]);
         let mut view = View::default();
@@ -421,7 +410,7 @@ mod tests {
 
     #[test]
     fn a_cut_cable_makes_two_groups_and_a_replugged_module_comes_back() {
-        let mut env = SnakeEnv::new(Arc::new(EnvConfig::new(Robot::default())));
+        let mut env = SnakeEnv::new(Arc::new(EnvConfig::new(Task::GoalReaching, Robot::default())));
         env.reset_with(
             1,
             &[
@@ -442,7 +431,8 @@ mod tests {
 
     #[test]
     fn only_the_head_is_told_when_only_the_head_knows() {
-        let config = EnvConfig { goal_known_to: GoalKnownTo::Head, ..EnvConfig::new(Robot::default()) };
+        let config =
+            EnvConfig { goal_known_to: GoalKnownTo::Head, ..EnvConfig::new(Task::GoalReaching, Robot::default()) };
         let env = SnakeEnv::new(Arc::new(config));
         let mut view = View::default();
         env.view(&mut view);
@@ -452,7 +442,7 @@ mod tests {
 
     #[test]
     fn an_episode_is_cut_at_the_cap_and_ends_at_the_goal() {
-        let mut config = EnvConfig::new(Robot::default());
+        let mut config = EnvConfig::new(Task::GoalReaching, Robot::default());
         config.task.cap = 3;
         let mut env = SnakeEnv::new(Arc::new(config));
         let still = [[0.0; 2]; 8];

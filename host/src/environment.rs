@@ -5,7 +5,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 /// Extra numbers per module that only the critic sees, and only in training (linear velocity, height, fault flags ...).
-pub const PRIVILEGED: usize = 12;
+pub const PRIVILEGED: usize = 16;
 
 /// One moment of a multi-module environment as the learner sees it. Every vector has one entry a module, head first.
 #[derive(Clone, Debug, Default, PartialEq)]

@@ -13,7 +13,8 @@ use crate::env::{EnvConfig, SnakeEnv};
 use crate::environment::{Environment, View};
 use crate::methods::mix;
 use crate::network::Network;
-use crate::sim::Motion;
+use crate::sim::{Motion, Snake};
+use crate::tasks::Judge;
 use crate::tasks::goal_reaching::Bearing;
 
 /// Who decides the torques.
@@ -96,6 +97,21 @@ pub struct Episode {
     pub motion: Motion,
     /// Steps whose highest link stayed below two link diameters.
     pub low_steps: u32,
+}
+
+impl Episode {
+    /// What came of an episode that is over.
+    pub fn new(judge: &Judge, snake: &Snake) -> Self {
+        let verdict = judge.verdict();
+        Episode {
+            success: verdict.success,
+            distance: verdict.distance,
+            steps: judge.steps(),
+            bearing: Bearing::of(judge.course().goal),
+            motion: snake.motion(),
+            low_steps: judge.low_steps(),
+        }
+    }
 }
 
 /// A share of episodes.
@@ -196,7 +212,6 @@ pub fn run_episode(
     mut each: impl FnMut(&SnakeEnv, &View),
 ) -> Episode {
     env.reset_with(seed, faults);
-    let bearing = Bearing::of(env.goal());
     let (mut view, mut actions) = (View::default(), Vec::new());
     for step in 0u64.. {
         env.view(&mut view);
@@ -204,14 +219,7 @@ pub fn run_episode(
         each(env, &view);
         let outcome = env.step(&actions);
         if outcome.terminated || outcome.truncated {
-            return Episode {
-                success: outcome.success,
-                distance: outcome.distance,
-                steps: outcome.steps,
-                bearing,
-                motion: env.motion(),
-                low_steps: env.low_steps(),
-            };
+            return Episode::new(env.judge(), env.snake());
         }
     }
     unreachable!("an episode ends at its cap")

@@ -29,8 +29,10 @@ pub struct Network {
     /// Whether the hidden layer sees the attention's context; if not, its last [`VALUE`] columns are zero.
     pub attention: bool,
     /// Mean of each field of the observation.
+    #[serde(with = "serde_big_array::BigArray")]
     pub mean: [f32; SIZE],
     /// Standard deviation of each field of the observation, positive.
+    #[serde(with = "serde_big_array::BigArray")]
     pub std: [f32; SIZE],
     /// Observation to embedding.
     pub encoder: Dense,

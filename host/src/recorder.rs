@@ -20,8 +20,12 @@ pub fn recording(config: &EnvConfig, policy: &str) -> Recording {
         torque_limit: robot.torque_limit,
         metres_per_unit: robot.scale.metres_per_unit,
     };
-    let mut recording =
-        Recording::new("COMPOSER on the simulated bus", "Goal Reaching", robot, config.task.success_distance);
+    let mut recording = Recording::new(
+        "COMPOSER on the simulated bus",
+        config.task.task().title(),
+        robot,
+        config.task.rules().goal_radius(),
+    );
     recording.note("policy", policy);
     recording
 }
@@ -56,8 +60,8 @@ impl Recorder {
             links,
             status,
             torques: (0..modules).map(|m| plant.snake().torque(m)).collect(),
-            goal: Some(plant.goal_in_world()),
-            distance: plant.distance(),
+            goal: Some(plant.judge().course().goal),
+            distance: plant.judge().verdict().distance,
             attention,
             ..FrameRecord::default()
         });

@@ -3,12 +3,17 @@
 use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
-use composer_shared::policy::{GoalKnownTo, Meta, Task};
+use composer_shared::policy::{GoalKnownTo, Meta};
 use serde::{Deserialize, Serialize};
 
 use crate::env::{EnvConfig, FaultTraining};
 use crate::robot::Robot;
+use crate::tasks::block_pushing::BlockPushing;
 use crate::tasks::goal_reaching::GoalReaching;
+use crate::tasks::shape_formation::ShapeFormation;
+use crate::tasks::tube_crossing::TubeCrossing;
+use crate::tasks::wall_climbing::WallClimbing;
+use crate::tasks::{AllRules, TaskConfig, TaskSettings};
 use crate::train::TrainConfig;
 
 /// Who is told the goal, in settings files.
@@ -69,8 +74,18 @@ pub struct RunConfig {
     pub train: TrainConfig,
     /// The environment.
     pub env: EnvSettings,
-    /// The task.
-    pub task: GoalReaching,
+    /// Which task, and what all tasks have.
+    pub task: TaskSettings,
+    /// Goal Reaching.
+    pub goal_reaching: GoalReaching,
+    /// Block Pushing.
+    pub block_pushing: BlockPushing,
+    /// Shape Formation.
+    pub shape_formation: ShapeFormation,
+    /// Tube Crossing.
+    pub tube_crossing: TubeCrossing,
+    /// Wall Climbing.
+    pub wall_climbing: WallClimbing,
     /// Faults drawn in training.
     pub faults: FaultTraining,
     /// The robot.
@@ -124,7 +139,6 @@ impl RunConfig {
     pub fn validate(&self) -> Result<()> {
         self.train.validate()?;
         self.robot.validate()?;
-        self.task.validate().map_err(anyhow::Error::msg)?;
         let substeps = self.env.control_period / self.robot.physics_step;
         if !(1.0..=100.0).contains(&substeps) || (substeps - substeps.round()).abs() > 1e-3 {
             bail!(
@@ -139,8 +153,10 @@ impl RunConfig {
                 "delay = [{least}, {most}]; it must rise and stay below the {substeps:.0} physics steps of a control step"
             );
         }
+        let task = self.task();
+        task.validate(&self.robot).map_err(anyhow::Error::msg)?;
         for &modules in &self.env.lengths {
-            self.robot.with_modules(modules)?;
+            task.validate(&self.robot.with_modules(modules)?).map_err(anyhow::Error::msg)?;
         }
         let faults = &self.faults;
         if !(0.0..=1.0).contains(&faults.probability) || !(0.0..1.0).contains(&faults.missed_latents) {
@@ -164,18 +180,32 @@ impl RunConfig {
     /// The environment without the robot's length being varied and without faults: what evaluation starts from.
     pub fn evaluation(&self) -> EnvConfig {
         EnvConfig {
-            task: self.task.clone(),
+            task: self.task(),
             goal_known_to: self.env.goal_known_to.into(),
             control_period: self.env.control_period,
             delay: [self.env.delay[0]; 2],
-            ..EnvConfig::new(self.robot.clone())
+            ..EnvConfig::new(self.task.name, self.robot.clone())
+        }
+    }
+
+    /// The task with all settings.
+    pub fn task(&self) -> TaskConfig {
+        TaskConfig {
+            settings: self.task.clone(),
+            rules: AllRules {
+                goal_reaching: self.goal_reaching.clone(),
+                block_pushing: self.block_pushing.clone(),
+                shape_formation: self.shape_formation.clone(),
+                tube_crossing: self.tube_crossing.clone(),
+                wall_climbing: self.wall_climbing.clone(),
+            },
         }
     }
 
     /// What a frozen policy of this run says about itself.
     pub fn meta(&self) -> Meta {
         Meta {
-            task: Task::GoalReaching,
+            task: self.task.name,
             goal_known_to: self.env.goal_known_to.into(),
             attention: self.train.method.attention(),
             trained_with_faults: self.faults.probability > 0.0,
@@ -195,9 +225,9 @@ mod tests {
     fn settings_are_found_by_their_name_and_checked() {
         let mut config = RunConfig::default();
         config.set("learning_rate=1").unwrap();
-        config.set("task.goal_distance=[4, 15]").unwrap();
+        config.set("goal_reaching.goal_distance=[4, 15]").unwrap();
         config.set("goal_known_to=head").unwrap();
-        assert_eq!((config.train.learning_rate, config.task.goal_distance), (1.0, [4.0, 15.0]));
+        assert_eq!((config.train.learning_rate, config.goal_reaching.goal_distance), (1.0, [4.0, 15.0]));
         assert_eq!(config.env.goal_known_to, Knows::Head);
         assert!(config.set("nonsense=1").unwrap_err().to_string().contains("no setting `nonsense`"));
         assert!(config.set("cap=-1").unwrap_err().to_string().contains("cap=-1 is not possible"));

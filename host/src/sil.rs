@@ -9,28 +9,21 @@ use composer_sim_bridge::Plant;
 use crate::env::EnvConfig;
 use crate::eval::Episode;
 use crate::sim::Snake;
-use crate::tasks::goal_reaching::Bearing;
+use crate::tasks::{Judge, Point};
 
 /// The snake, its goal, and the task's verdict at the end of every control period.
 pub struct SnakePlant {
     config: Arc<EnvConfig>,
     snake: Snake,
-    goal: [f32; 3],
+    judge: Judge,
     physics_steps: usize,
-    low_steps: u32,
-    distance: f32,
-    success: bool,
 }
 
 impl SnakePlant {
     /// The start of the episode with this seed, the same as [`crate::env::SnakeEnv`]'s.
     pub fn new(config: Arc<EnvConfig>, seed: u64) -> Self {
-        let snake = Snake::new(&config.robot);
-        let goal = config.task.goal(seed, config.robot.link_radius);
-        let mut plant =
-            SnakePlant { config, snake, goal, physics_steps: 0, low_steps: 0, distance: 0.0, success: false };
-        plant.distance = plant.snake.head_distance(plant.goal);
-        plant
+        let (snake, judge) = Judge::start(&config.task, seed, &config.robot);
+        SnakePlant { config, snake, judge, physics_steps: 0 }
     }
 
     /// The snake.
@@ -38,31 +31,14 @@ impl SnakePlant {
         &self.snake
     }
 
-    /// The goal in the world.
-    pub fn goal_in_world(&self) -> [f32; 3] {
-        self.goal
-    }
-
-    /// Distance of the head to the goal, as of the last control period.
-    pub fn distance(&self) -> f32 {
-        self.distance
-    }
-
-    /// Whole control periods so far.
-    pub fn steps(&self) -> u32 {
-        (self.physics_steps / self.config.substeps()) as u32
+    /// The scene of the episode and what came of it so far.
+    pub fn judge(&self) -> &Judge {
+        &self.judge
     }
 
     /// What came of the episode.
     pub fn episode(&self) -> Episode {
-        Episode {
-            success: self.success,
-            distance: self.distance,
-            steps: self.steps(),
-            bearing: Bearing::of(self.goal),
-            motion: self.snake.motion(),
-            low_steps: self.low_steps,
-        }
+        Episode::new(&self.judge, &self.snake)
     }
 }
 
@@ -79,8 +55,8 @@ impl Plant for SnakePlant {
         self.snake.sensors(module)
     }
 
-    fn goal(&self) -> Option<[f32; 3]> {
-        Some(self.snake.in_head_frame(self.goal))
+    fn point(&self, number: u8) -> Option<Point> {
+        self.judge.point_from_head(&self.config.task, &self.snake, number)
     }
 
     fn set_torque(&mut self, module: usize, torque: [f32; AXES]) {
@@ -89,17 +65,14 @@ impl Plant for SnakePlant {
 
     fn step(&mut self) {
         self.snake.step();
+        self.judge.watch(&self.config.task, &self.snake);
         self.physics_steps += 1;
         if self.physics_steps.is_multiple_of(self.config.substeps()) {
-            self.distance = self.snake.head_distance(self.goal);
-            self.success |= self.distance < self.config.task.success_distance;
-            if self.snake.height() < 4.0 * self.config.robot.link_radius {
-                self.low_steps += 1;
-            }
+            self.judge.step(&self.config.task, &self.snake);
         }
     }
 
     fn done(&self) -> bool {
-        self.success || self.steps() >= self.config.task.cap
+        self.judge.verdict().success || self.judge.steps() >= self.config.task.settings.cap
     }
 }

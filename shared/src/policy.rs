@@ -76,6 +76,17 @@ impl Task {
         }
     }
 
+    /// The paper's name of it.
+    pub const fn title(self) -> &'static str {
+        match self {
+            Task::GoalReaching => "Goal Reaching",
+            Task::BlockPushing => "Block Pushing",
+            Task::ShapeFormation => "Shape Formation",
+            Task::TubeCrossing => "Tube Crossing",
+            Task::WallClimbing => "Wall Climbing",
+        }
+    }
+
     /// The task of that name.
     pub fn from_name(name: &str) -> Option<Self> {
         Task::ALL.into_iter().find(|task| task.name() == name)

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::Result;
+use composer_shared::policy::Task;
 use composer_sim_bridge::sil::{self, SilConfig};
 
 use super::PolicySource;
@@ -29,7 +30,7 @@ pub struct Arguments {
 
 /// Control steps per second over all threads.
 fn physics(robot: &Robot, threads: usize, seconds: f64) -> f64 {
-    let config = Arc::new(EnvConfig::new(robot.clone()));
+    let config = Arc::new(EnvConfig::new(Task::GoalReaching, robot.clone()));
     let rates = parallel(threads, threads, |thread| {
         let mut env = SnakeEnv::new(config.clone());
         let (mut view, mut actions) = (View::default(), Vec::new());
@@ -64,7 +65,7 @@ fn training(config: &RunConfig, seconds: f64) -> Result<Times> {
 
 /// Virtual time by wall time of one thread, whole episodes on the bus.
 fn bus(image: &[u8], robot: &Robot, seconds: f64) -> Result<(f64, f64)> {
-    let config = Arc::new(EnvConfig::new(robot.clone()));
+    let config = Arc::new(EnvConfig::new(Task::GoalReaching, robot.clone()));
     let (start, mut virtual_ns, mut load, mut episodes) = (Instant::now(), 0u64, 0.0, 0u64);
     while start.elapsed().as_secs_f64() < seconds {
         let mut plant = SnakePlant::new(config.clone(), episode_seed(1, episodes));

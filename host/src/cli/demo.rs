@@ -29,7 +29,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let name = "goal-reaching";
     let source = PolicySource::load(name)?;
     let PolicySource::Image(image) = &source else { anyhow::bail!("{name} ships as an image") };
-    let config = Arc::new(source.environment(None)?);
+    let config = Arc::new(source.environment(None, None)?);
     println!(
         "{} modules, each running the frozen {name} policy ({} bytes) in its own controller, on a simulated CAN-FD bus (1M/5M).\n",
         config.robot.modules,
@@ -51,6 +51,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         let fault: FaultPlan = fault.parse().with_context(|| format!("the fault {fault}"))?;
         let common = Common {
             policy: name.into(),
+            task: None,
             episodes: arguments.episodes,
             modules: None,
             robot: None,

@@ -4,9 +4,10 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use anyhow::{Result, bail};
+use composer_shared::policy::Task;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::PolicySource;
+use super::{PolicySource, task_by_name};
 use composer_sim_bridge::faults::{FaultPlan, ScheduledFault};
 
 use crate::env::knows_fault;
@@ -18,6 +19,9 @@ use crate::robot::Robot;
 pub struct Common {
     /// A policy image, a run folder, the name of a shipped policy, or a baseline: still, random
     pub policy: String,
+    /// What is to be done, for a baseline [default: goal-reaching]; a policy does what it was trained for
+    #[arg(long, value_parser = task_by_name)]
+    pub task: Option<Task>,
     /// Episodes to run
     #[arg(long, default_value_t = 200, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     pub episodes: u64,
@@ -78,7 +82,7 @@ pub struct Arguments {
 pub fn run(arguments: &Arguments) -> Result<()> {
     let common = &arguments.common;
     let source = PolicySource::load(&common.policy)?;
-    let config = Arc::new(source.environment(common.robot()?.as_ref())?);
+    let config = Arc::new(source.environment(common.task, common.robot()?.as_ref())?);
     common.fault.check(config.robot.modules)?;
     if let Some(fault) = common.fault.faults.iter().find(|fault| !knows_fault(&fault.kind)) {
         bail!("{fault} happens on a bus: `snakectl sil` has one; eval knows action, observation, unplug and cut");

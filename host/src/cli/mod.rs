@@ -13,6 +13,7 @@ mod train;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
+use composer_shared::policy::Task;
 
 pub use policy_file::PolicySource;
 
@@ -72,6 +73,12 @@ pub fn main() -> ExitCode {
             ExitCode::FAILURE
         }
     }
+}
+
+/// A task by its name, for the command line.
+fn task_by_name(name: &str) -> Result<Task, String> {
+    let names = Task::ALL.map(Task::name);
+    Task::from_name(name).ok_or_else(|| format!("there is no such task; the tasks are {}", names.join(", ")))
 }
 
 /// Threads to use when nobody says otherwise: one a core.

@@ -59,12 +59,33 @@ impl PolicySource {
         })
     }
 
-    /// The environment that the policy was made for, on `robot` (default: the one it was trained with, else the paper's).
-    pub fn environment(&self, robot: Option<&Robot>) -> Result<EnvConfig> {
+    /// The task that the policy was made for; baselines are made for none.
+    fn task(&self) -> Result<Option<Task>> {
+        Ok(match self {
+            PolicySource::Image(image) => Some(Policy::parse(image).map_err(|e| anyhow::anyhow!("{e}"))?.task()),
+            PolicySource::Run(run) => Some(run.1.task.name),
+            PolicySource::Still | PolicySource::Random => None,
+        })
+    }
+
+    /// The environment that the policy was made for, on `robot` (default: the one it was trained with, else the paper's). `task` is
+    /// what is to be done: a policy of another task is refused, a baseline does anything.
+    pub fn environment(&self, task: Option<Task>, robot: Option<&Robot>) -> Result<EnvConfig> {
+        if let (Some(wanted), Some(made_for)) = (task, self.task()?)
+            && wanted != made_for
+        {
+            bail!("the policy was trained for {made_for} and cannot do {wanted}: choose a policy of that task");
+        }
+        let config = self.any_environment(task, robot)?;
+        config.task.validate(&config.robot).map_err(anyhow::Error::msg)?;
+        Ok(config)
+    }
+
+    fn any_environment(&self, task: Option<Task>, robot: Option<&Robot>) -> Result<EnvConfig> {
         match self {
             PolicySource::Image(image) => {
                 let policy = Policy::parse(image).map_err(|e| anyhow::anyhow!("{e}"))?;
-                let mut config = EnvConfig::new(robot.cloned().unwrap_or_default());
+                let mut config = EnvConfig::new(policy.task(), robot.cloned().unwrap_or_default());
                 check(&policy, &config.robot)?;
                 config.goal_known_to = policy.goal_known_to();
                 config.control_period = policy.control_period_us() as f32 * 1e-6;
@@ -77,16 +98,15 @@ impl PolicySource {
                 }
                 Ok(config)
             }
-            PolicySource::Still | PolicySource::Random => Ok(EnvConfig::new(robot.cloned().unwrap_or_default())),
+            PolicySource::Still | PolicySource::Random => {
+                Ok(EnvConfig::new(task.unwrap_or(Task::GoalReaching), robot.cloned().unwrap_or_default()))
+            }
         }
     }
 }
 
-/// Refuses a policy of another task or of a robot that its modules could not control.
+/// Refuses a policy of a robot that its modules could not control.
 fn check(policy: &Policy, robot: &Robot) -> Result<()> {
-    if policy.task() != Task::GoalReaching {
-        bail!("the policy was trained for {}; only goal-reaching can be run", policy.task().name());
-    }
     if policy.geometry() != robot.geometry() || policy.limits() != robot.limits() {
         bail!(
             "the policy was trained for modules with {:?} and {:?}; the robot {} has {:?} and {:?}",

@@ -91,7 +91,7 @@ fn finish(run: &Run, arguments: &Arguments) -> Result<bool> {
     config.train.total_steps = arguments.steps;
     config.train.evaluate_every = (arguments.steps / 10).max(1);
     config.env.goal_known_to = run.knows;
-    config.task.reward = crate::tasks::goal_reaching::Reward::Progress;
+    config.task.reward = crate::tasks::Reward::Progress;
     let resuming = run.folder.join(CONFIG_FILE).exists();
     if resuming && load_config(&run.folder.join(CONFIG_FILE))? != config {
         bail!("{} holds a run with other settings; choose another --runs folder", run.folder.display());

@@ -202,7 +202,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             common.policy
         );
     };
-    let config = Arc::new(source.environment(common.robot()?.as_ref())?);
+    let config = Arc::new(source.environment(common.task, common.robot()?.as_ref())?);
     warn_if_crowded(&arguments.bus, &config);
     let record = if arguments.replay.is_some() { REPLAYED } else { 0 };
     let trial = BusTrial { config: config.clone(), image, common, bus: &arguments.bus, record };
@@ -231,7 +231,8 @@ pub fn run(arguments: &Arguments) -> Result<()> {
 /// Says so if the frames of a cycle do not fit the control period (at the default bit rates): it still runs, but the tail is never heard.
 fn warn_if_crowded(bus: &BusOptions, config: &EnvConfig) {
     let kind = if bus.bus == Bus::Fd { BusKind::Fd } else { BusKind::Classic };
-    let needed_ms = f64::from(Timing::bus_time_us(kind, config.robot.modules as u8)) * 1e-3;
+    let modules = config.robot.modules as u8;
+    let needed_ms = f64::from(Timing::bus_time_us(kind, modules, config.task.task().points(modules))) * 1e-3;
     let period_ms = f64::from(config.control_period) * 1e3;
     if bus.bitrate.is_none() && needed_ms > period_ms {
         eprintln!(

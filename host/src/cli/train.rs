@@ -8,6 +8,7 @@ use composer_shared::policy::Task;
 use crc::{CRC_32_ISO_HDLC, Crc};
 
 use super::policy_file::{CONFIG_FILE, NETWORK_FILE, load_config};
+use super::task_by_name;
 use crate::env::SnakeEnv;
 use crate::eval::{Pilot, Report, Trial, healthy};
 use crate::files::{create_folder, write_whole};
@@ -23,9 +24,10 @@ const EVALUATION_SEED: u64 = 0x7a1e;
 /// Arguments of `train`.
 #[derive(clap::Args, Clone, Debug)]
 pub struct Arguments {
-    /// What to learn; so far goal-reaching
-    #[arg(default_value = "goal-reaching")]
-    task: String,
+    /// What to learn: goal-reaching, block-pushing, shape-formation, tube-crossing or wall-climbing [default: the settings file's, else
+    /// goal-reaching]
+    #[arg(value_parser = task_by_name)]
+    task: Option<Task>,
     /// composer-no-imagination (self-attention) or mappo (no attention) [default: composer-no-imagination]
     #[arg(long)]
     method: Option<Method>,
@@ -54,17 +56,22 @@ pub struct Arguments {
 
 /// Runs the verb.
 pub fn run(arguments: Arguments) -> Result<()> {
-    match Task::from_name(&arguments.task) {
-        Some(Task::GoalReaching) => {}
-        Some(other) => bail!("{} cannot be trained yet; goal-reaching can", other.name()),
-        None => bail!("there is no task {}; goal-reaching is one", arguments.task),
-    }
     let resuming = arguments.resume.is_some();
     let mut config = match (&arguments.resume, &arguments.config) {
         (Some(folder), _) => load_config(&folder.join(CONFIG_FILE))?,
         (None, Some(file)) => load_config(file)?,
         (None, None) => RunConfig::default(),
     };
+    if let Some(task) = arguments.task {
+        let asked_for = arguments.resume.is_some() || arguments.config.is_some();
+        if asked_for && config.task.name != task {
+            bail!(
+                "the settings are for {}, not for {task}: leave the task out, or choose other settings",
+                config.task.name
+            );
+        }
+        config.task.name = task;
+    }
     if let Some(file) = &arguments.robot {
         config.robot = Robot::load(file)?;
     }
@@ -81,7 +88,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
         config.set(setting)?;
     }
     config.validate()?;
-    let name = format!("{}-{}-{}", arguments.task, config.train.method, config.train.seed);
+    let name = format!("{}-{}-{}", config.task.name, config.train.method, config.train.seed);
     let out = arguments.resume.or(arguments.out).unwrap_or_else(|| Path::new("runs").join(name));
     let summary = train_in(&config, &out, resuming)?;
     println!(
@@ -158,5 +165,8 @@ fn save_network(out: &Path, network: &Network) -> Result<()> {
 fn fingerprint(config: &RunConfig) -> String {
     let world = RunConfig { train: Default::default(), ..config.clone() };
     let digest = Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(toml::to_string(&world).unwrap_or_default().as_bytes());
-    format!("goal-reaching on {} with {} modules, settings {digest:08x}", config.robot.name, config.robot.modules)
+    format!(
+        "{} on {} with {} modules, settings {digest:08x}",
+        config.task.name, config.robot.name, config.robot.modules
+    )
 }

@@ -5,8 +5,9 @@
 //! `tau - k q - c w`, and `c = tau_max / no-load speed` is the slope of the torque-speed line. Implicit, because at these
 //! stiffnesses an explicit torque would need a tenth of the step.
 //!
-//! Ground, walls and blocks are frictionless for rapier; friction is an explicit anisotropic Coulomb force in the plane of each
-//! contact, with the contact's own load, normal and point (`Snake::apply_friction`).
+//! Ground and walls are frictionless for rapier; the snake's friction on them is an explicit anisotropic Coulomb force in the plane of
+//! each contact, with the contact's own load, normal and point (`Snake::apply_friction`). A block that can be pushed has rapier's
+//! own isotropic friction, on the ground and on the body.
 //!
 //! World frame: x and y horizontal, z up; the snake lies along x with its head towards +x.
 
@@ -17,10 +18,17 @@ use rapier3d::prelude::*;
 
 use crate::robot::Robot;
 
+pub mod scene;
+
+pub use scene::Scene;
+
 /// Below this sliding speed (units/s) friction fades out linearly instead of flipping its sign.
 const STILL_SPEED: f32 = 0.01;
 /// Faster than the no-load speed the drive brakes with this many times its normal damping.
 const OVERSPEED_BRAKE: f32 = 8.0;
+
+/// Collision group of everything besides the snake.
+const SCENE: InteractionGroups = InteractionGroups::new(Group::GROUP_32, Group::ALL, InteractionTestMode::And);
 
 /// Extremes of the motion, for the sanity of what was learnt.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -38,6 +46,7 @@ pub struct Snake {
     robot: Robot,
     world: PhysicsWorld,
     links: Vec<RigidBodyHandle>,
+    block: Option<RigidBodyHandle>,
     joints: Vec<ImpulseJointHandle>,
     /// Torque on each axis of each module now, and where it is heading.
     torque: Vec<[f32; AXES]>,
@@ -60,6 +69,11 @@ fn groups(module: usize) -> InteractionGroups {
 impl Snake {
     /// A straight snake at rest on level ground, its head link centred at the origin.
     pub fn new(robot: &Robot) -> Self {
+        Self::in_scene(robot, &Scene::default())
+    }
+
+    /// The same with something else on the ground.
+    pub fn in_scene(robot: &Robot, scene: &Scene) -> Self {
         let mut world = PhysicsWorld { gravity: Vector::new(0.0, 0.0, -robot.gravity), ..PhysicsWorld::default() };
         let parameters = &mut world.integration_parameters;
         parameters.dt = robot.physics_step;
@@ -70,9 +84,10 @@ impl Snake {
         world.colliders.insert(
             ColliderBuilder::halfspace(rapier3d::na::Unit::new_unchecked(Vector::Z))
                 .friction(0.0)
-                .collision_groups(InteractionGroups::new(Group::GROUP_32, Group::ALL, InteractionTestMode::And))
+                .collision_groups(SCENE)
                 .build(),
         );
+        let block = scene.build(&mut world);
         let (length, radius) = (robot.link_length, robot.link_radius);
         let mut links = Vec::with_capacity(robot.links());
         let mut joints = Vec::with_capacity(robot.links() - 1);
@@ -113,6 +128,7 @@ impl Snake {
             robot: robot.clone(),
             world,
             links,
+            block,
             joints,
             torque: vec![[0.0; AXES]; robot.modules],
             command: vec![[0.0; AXES]; robot.modules],
@@ -182,6 +198,10 @@ impl Snake {
         let dt = self.robot.physics_step;
         let (along, across) = (self.robot.friction_along, self.robot.friction_across);
         for pair in self.world.narrow_phase.contact_pairs() {
+            // The block has rapier's friction.
+            if self.block.is_some() && [pair.collider1, pair.collider2].into_iter().any(|c| self.is_block(c)) {
+                continue;
+            }
             for manifold in pair.solver_manifolds() {
                 let load: f32 = manifold.points.iter().map(|p| p.data.impulse).sum::<f32>() / dt;
                 if load <= 0.0 {
@@ -221,6 +241,35 @@ impl Snake {
                 }
             }
         }
+    }
+
+    fn is_block(&self, collider: ColliderHandle) -> bool {
+        self.block.is_some() && self.world.colliders[collider].parent() == self.block
+    }
+
+    /// Position and rotation (quaternion x, y, z, w) of the block, if there is one.
+    pub fn block(&self) -> Option<([f32; 3], [f32; 4])> {
+        self.block.map(|handle| {
+            let body = &self.world.bodies[handle];
+            let r = body.rotation();
+            (body.translation().to_array(), [r.x, r.y, r.z, r.w])
+        })
+    }
+
+    /// Where a module is: the centre of its own link, units.
+    pub fn module_position(&self, module: usize) -> [f32; 3] {
+        self.own_link(module).translation().to_array()
+    }
+
+    /// Rotation of a module's own frame, quaternion x, y, z, w.
+    pub fn module_rotation(&self, module: usize) -> [f32; 4] {
+        let r = self.own_link(module).rotation();
+        [r.x, r.y, r.z, r.w]
+    }
+
+    /// Centre of the last link in the world.
+    pub fn tail(&self) -> [f32; 3] {
+        self.world.bodies[self.links[self.links.len() - 1]].translation().to_array()
     }
 
     fn joint_speed(&self, index: usize) -> f32 {

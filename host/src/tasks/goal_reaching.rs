@@ -1,33 +1,26 @@
-//! Goal Reaching (paper, Table I): bring the head to a point on the ground.
+//! Goal Reaching: bring the head to a goal on the ground (paper, Table I, first row).
 //!
-//! | what | value |
+//! | | |
 //! |---|---|
-//! | scene | level ground; the snake lies straight, its head at the origin, facing +x |
+//! | start | straight, at rest, head at the origin, facing +x |
 //! | goal | a point at rest height, `goal_distance` units from the head in any direction |
-//! | reward `paper` | `-0.1 d(head, goal)` a step (the paper's `-d`; the learner's value normalisation makes the factor immaterial) |
-//! | reward `progress` | decrease of `d(head, goal)` in units, and 2 on success: the same optimum by potential shaping, denser |
-//! | `rearing_penalty` | taken off for rearing up; 0 unless set |
+//! | reward `paper` | `-d(head, goal)` |
+//! | left to do (`progress`) | `d(head, goal)` |
 //! | success | `d(head, goal) < 2` units (the paper's `d_g`); ends the episode |
-//! | cap | 125 control steps of 0.05 s; the value of the last state is bootstrapped |
+//! | points on the bus | 0: the goal |
+//! | imagined distance | mean over the modules of `d(p'_i, goal)` |
 //!
 //! Observation: [`composer_shared::observation`]. `d` is measured from the centre of the head link.
 
-use rand::{RngExt, SeedableRng};
+use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-/// Which reward the learner gets.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Reward {
-    /// The paper's: minus the distance.
-    #[default]
-    Paper,
-    /// The decrease of the distance.
-    Progress,
-}
+use super::{Course, Gate, Point, Rules, Verdict, between, distance, either_side};
+use crate::robot::Robot;
+use crate::sim::Snake;
 
-/// Settings of the task; the defaults are the paper's difficulty, see the module documentation.
+/// Settings of the task; the defaults are the paper's difficulty, see `success` in the module documentation.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GoalReaching {
@@ -37,31 +30,16 @@ pub struct GoalReaching {
     pub goal_bearing: f32,
     /// Distance that counts as reached, units.
     pub success_distance: f32,
-    /// Control steps before the episode is cut.
-    pub cap: u32,
-    /// Reward of the training.
-    pub reward: Reward,
-    /// Taken off the reward of a step for each unit that the highest link is above one and a half link diameters. The paper has
-    /// no such term; without it the fastest policies rear up and throw themselves at the goal.
-    pub rearing_penalty: f32,
 }
 
 impl Default for GoalReaching {
     fn default() -> Self {
-        GoalReaching {
-            goal_distance: [10.0, 25.0],
-            goal_bearing: 180.0,
-            success_distance: 2.0,
-            cap: 125,
-            reward: Reward::Paper,
-            rearing_penalty: 0.0,
-        }
+        GoalReaching { goal_distance: [10.0, 25.0], goal_bearing: 180.0, success_distance: 2.0 }
     }
 }
 
-impl GoalReaching {
-    /// Checks the settings; the error is a sentence.
-    pub fn validate(&self) -> Result<(), String> {
+impl Rules for GoalReaching {
+    fn validate(&self, _robot: &Robot) -> Result<(), String> {
         let [near, far] = self.goal_distance;
         if !(near > self.success_distance && far >= near && far < 100.0) {
             return Err(format!(
@@ -69,39 +47,32 @@ impl GoalReaching {
                 self.success_distance
             ));
         }
-        if !(self.goal_bearing >= 0.0 && self.goal_bearing <= 180.0) {
-            return Err(format!("goal_bearing = {}; it is an angle of 0 to 180 degrees", self.goal_bearing));
-        }
-        if self.success_distance.is_nan() || self.success_distance <= 0.0 {
-            return Err(format!("success_distance = {}; it must be above zero", self.success_distance));
-        }
-        if !(self.rearing_penalty >= 0.0 && self.rearing_penalty.is_finite()) {
-            return Err(format!("rearing_penalty = {}; it must be zero or more", self.rearing_penalty));
-        }
-        if self.cap == 0 {
-            return Err("cap = 0; an episode needs at least one step".into());
-        }
-        Ok(())
+        super::check_number("goal_bearing", self.goal_bearing, [0.0, 180.0])?;
+        super::check_number("success_distance", self.success_distance, [0.01, 100.0])
     }
 
-    /// The goal of an episode, relative to a head at the origin facing +x, at the given height.
-    pub fn goal(&self, seed: u64, height: f32) -> [f32; 3] {
+    fn goal_radius(&self) -> f32 {
+        self.success_distance
+    }
+
+    fn course(&self, seed: u64, robot: &Robot) -> Course {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let [near, far] = self.goal_distance;
-        let distance = near + (far - near) * rng.random::<f32>();
-        let bearing = self.goal_bearing.to_radians() * (2.0 * rng.random::<f32>() - 1.0);
-        let (sin, cos) = libm::sincosf(bearing);
-        [distance * cos, distance * sin, height]
+        let distance = between(&mut rng, self.goal_distance);
+        let (sin, cos) = libm::sincosf(either_side(&mut rng, self.goal_bearing));
+        Course { goal: [distance * cos, distance * sin, robot.link_radius], ..Course::default() }
     }
 
-    /// The reward for coming from distance `before` to `after`, with the highest link `too_high` units above one and a half
-    /// link diameters.
-    pub fn reward(&self, before: f32, after: f32, success: bool, too_high: f32) -> f32 {
-        let task = match self.reward {
-            Reward::Paper => -0.1 * after,
-            Reward::Progress => before - after + if success { 2.0 } else { 0.0 },
-        };
-        task - self.rearing_penalty * too_high.max(0.0)
+    fn point(&self, course: &Course, _snake: &Snake, number: u8) -> Option<Point> {
+        (number == 0).then_some(course.goal)
+    }
+
+    fn verdict(&self, course: &Course, snake: &Snake, _gate: &mut Gate) -> Verdict {
+        let distance = snake.head_distance(course.goal);
+        Verdict { paper: -distance, left: distance, distance, success: distance < self.success_distance }
+    }
+
+    fn imagined_distance(&self, course: &Course, _snake: &Snake, positions: &[Point]) -> f32 {
+        positions.iter().map(|p| distance(*p, course.goal)).sum::<f32>() / positions.len().max(1) as f32
     }
 }
 
@@ -122,7 +93,7 @@ impl Bearing {
     pub const ALL: [Bearing; 3] = [Bearing::Ahead, Bearing::Aside, Bearing::Behind];
 
     /// The bearing of a goal given relative to the head.
-    pub fn of(goal: [f32; 3]) -> Self {
+    pub fn of(goal: Point) -> Self {
         match libm::atan2f(goal[1], goal[0]).abs().to_degrees() {
             a if a < 60.0 => Bearing::Ahead,
             a if a <= 120.0 => Bearing::Aside,
@@ -137,11 +108,11 @@ mod tests {
 
     #[test]
     fn goals_lie_in_every_direction_at_the_distance_asked_for() {
-        let task = GoalReaching::default();
+        let (task, robot) = (GoalReaching::default(), Robot::default());
         let mut seen = [0; 3];
         for seed in 0..600 {
-            let goal = task.goal(seed, 0.4);
-            assert_eq!(goal, task.goal(seed, 0.4));
+            let goal = task.course(seed, &robot).goal;
+            assert_eq!(goal, task.course(seed, &robot).goal);
             let distance = goal[0].hypot(goal[1]);
             assert!((10.0..=25.0).contains(&distance));
             seen[Bearing::ALL.iter().position(|b| *b == Bearing::of(goal)).unwrap()] += 1;
@@ -152,7 +123,8 @@ mod tests {
     #[test]
     fn settings_that_cannot_be_are_refused() {
         let bad = GoalReaching { goal_distance: [1.0, 5.0], ..GoalReaching::default() };
-        assert!(bad.validate().unwrap_err().contains("beyond the success distance"));
-        assert!(GoalReaching { cap: 0, ..GoalReaching::default() }.validate().is_err());
+        assert!(bad.validate(&Robot::default()).unwrap_err().contains("beyond the success distance"));
+        let bad = GoalReaching { goal_bearing: f32::NAN, ..GoalReaching::default() };
+        assert!(bad.validate(&Robot::default()).unwrap_err().contains("goal_bearing"));
     }
 }

@@ -476,9 +476,7 @@ impl Message {
                 reserved(m.reserved)?;
                 Message::Sync(m)
             }
-            Function::Goal => {
-                Message::Goal(decode(function, body)?)
-            }
+            Function::Goal => Message::Goal(decode(function, body)?),
             Function::State => {
                 let m: State = decode(function, body)?;
                 reserved(m.health.0 & Health::RESERVED)?;

@@ -1,0 +1,140 @@
+//! Block Pushing: push a free block to a goal with any part of the body (paper, Table I, second row).
+//!
+//! | | |
+//! |---|---|
+//! | start | straight, at rest, head at the origin, facing +x |
+//! | block | a box `block_distance` units from the head, within `block_bearing` of straight ahead, turned at random |
+//! | goal | `goal_distance` units beyond the block, within `goal_bearing` of the line from the head through the block |
+//! | reward `paper` | `-d(head, block) - d(block, goal)` |
+//! | left to do (`progress`) | `d(head, P) + 2 d(block, goal)`, where P is the place behind the block from which it is pushed |
+//! | success | `d(block, goal) < 1` unit (SomoGym's); ends the episode |
+//! | points on the bus | 0: the goal, 1: the block's centre |
+//! | imagined distance | mean over the modules of `d(p'_i, P)` |
+//!
+//! Distances are measured on the ground plane between centres. The block has friction on the ground and on the body.
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+use super::{Course, Gate, Point, Rules, Verdict, between, check_number, check_range, distance, either_side};
+use crate::robot::Robot;
+use crate::sim::Snake;
+use crate::sim::scene::{Block, Scene};
+
+/// Settings of the task.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct BlockPushing {
+    /// Edges of the block: length, width, height, units.
+    pub block_size: [f32; 3],
+    /// Mass of the block, kg.
+    pub block_mass: f32,
+    /// Its coefficient of friction with ground and body.
+    pub block_friction: f32,
+    /// Nearest and farthest block, units from the head.
+    pub block_distance: [f32; 2],
+    /// Blocks lie within this angle to either side of straight ahead, degrees.
+    pub block_bearing: f32,
+    /// Nearest and farthest goal, units from the block.
+    pub goal_distance: [f32; 2],
+    /// Goals lie within this angle to either side of the line from the head through the block, degrees.
+    pub goal_bearing: f32,
+    /// Distance of the block to the goal that counts as there, units.
+    pub success_distance: f32,
+}
+
+impl Default for BlockPushing {
+    fn default() -> Self {
+        BlockPushing {
+            block_size: [1.5, 1.5, 1.0],
+            block_mass: 0.01,
+            block_friction: 0.5,
+            block_distance: [3.0, 6.0],
+            block_bearing: 30.0,
+            goal_distance: [4.0, 8.0],
+            goal_bearing: 30.0,
+            success_distance: 1.0,
+        }
+    }
+}
+
+impl BlockPushing {
+    fn block(snake: &Snake) -> Point {
+        snake.block().map_or([0.0; 3], |(position, _)| position)
+    }
+
+    /// The place on the far side of the block from the goal, a link's radius off its circumference.
+    fn push_from(&self, block: Point, goal: Point, radius: f32) -> Point {
+        let apart = [block[0] - goal[0], block[1] - goal[1]];
+        let length = libm::hypotf(apart[0], apart[1]).max(1e-3);
+        let reach = (0.5 * self.block_size[0].max(self.block_size[1]) + radius) / length;
+        [block[0] + reach * apart[0], block[1] + reach * apart[1], radius]
+    }
+}
+
+fn flat(a: Point, b: Point) -> f32 {
+    libm::hypotf(a[0] - b[0], a[1] - b[1])
+}
+
+impl Rules for BlockPushing {
+    fn validate(&self, robot: &Robot) -> Result<(), String> {
+        for edge in self.block_size {
+            check_number("an edge of block_size", edge, [0.1, 10.0])?;
+        }
+        check_number("block_mass", self.block_mass, [1e-4, 10.0])?;
+        check_number("block_friction", self.block_friction, [0.0, 5.0])?;
+        let half_diagonal = 0.5 * self.block_size[0].hypot(self.block_size[1]);
+        let clear = half_diagonal + 0.5 * robot.link_length + robot.link_radius;
+        check_range("block_distance", self.block_distance, [clear, 100.0])
+            .map_err(|e| format!("{e}: nearer, the block would stand on the snake"))?;
+        check_number("block_bearing", self.block_bearing, [0.0, 90.0])?;
+        check_number("success_distance", self.success_distance, [0.01, 100.0])?;
+        check_range("goal_distance", self.goal_distance, [1.001 * self.success_distance, 100.0])
+            .map_err(|e| format!("{e}: nearer, the block would be at its goal from the start"))?;
+        check_number("goal_bearing", self.goal_bearing, [0.0, 180.0])
+    }
+
+    fn goal_radius(&self) -> f32 {
+        self.success_distance
+    }
+
+    fn course(&self, seed: u64, _robot: &Robot) -> Course {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let (away, bearing) = (between(&mut rng, self.block_distance), either_side(&mut rng, self.block_bearing));
+        let (further, turn) = (between(&mut rng, self.goal_distance), either_side(&mut rng, self.goal_bearing));
+        let (sin, cos) = libm::sincosf(bearing);
+        let half = self.block_size.map(|edge| 0.5 * edge);
+        let position = [away * cos, away * sin, half[2]];
+        let (sin, cos) = libm::sincosf(bearing + turn);
+        let goal = [position[0] + further * cos, position[1] + further * sin, half[2]];
+        let yaw = std::f32::consts::PI * rng.random::<f32>();
+        let block = Block { half, position, yaw, mass: self.block_mass, friction: self.block_friction };
+        Course { scene: Scene { solids: Vec::new(), block: Some(block) }, goal, marks: Vec::new() }
+    }
+
+    fn point(&self, course: &Course, snake: &Snake, number: u8) -> Option<Point> {
+        match number {
+            0 => Some(course.goal),
+            1 => Some(Self::block(snake)),
+            _ => None,
+        }
+    }
+
+    fn verdict(&self, course: &Course, snake: &Snake, _gate: &mut Gate) -> Verdict {
+        let (head, block) = (snake.head(), Self::block(snake));
+        let to_goal = flat(block, course.goal);
+        let behind = self.push_from(block, course.goal, snake.robot().link_radius);
+        Verdict {
+            paper: -flat(head, block) - to_goal,
+            left: flat(head, behind) + 2.0 * to_goal,
+            distance: to_goal,
+            success: to_goal < self.success_distance,
+        }
+    }
+
+    fn imagined_distance(&self, course: &Course, snake: &Snake, positions: &[Point]) -> f32 {
+        let behind = self.push_from(Self::block(snake), course.goal, snake.robot().link_radius);
+        positions.iter().map(|p| distance(*p, behind)).sum::<f32>() / positions.len().max(1) as f32
+    }
+}

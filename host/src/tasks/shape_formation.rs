@@ -1,0 +1,169 @@
+//! Shape Formation: every module to a target of its own, together a shape (paper, Table I, third row).
+//!
+//! | | |
+//! |---|---|
+//! | start | straight, at rest, head at the origin, facing +x |
+//! | targets | one a module, a module's length apart along a curve: line, arc, C, S, U, ring or spiral, bent to either side; its middle up to `place` units from the snake's, turned by up to `heading` |
+//! | reward `paper` | `-sum_i d(module_i, target_i)` |
+//! | left to do (`progress`) | `sum_i d(module_i, target_i)` |
+//! | success | mean over the modules of `d(module_i, target_i)` < 1 unit: the paper's sum is below `n d_g`; ends the episode |
+//! | points on the bus | i: the target of module i |
+//! | imagined distance | Wasserstein distance between `p'` and the targets: the least mean distance over all assignments |
+//!
+//! A module is where its own link is ([`composer_shared::robot::Geometry::OWN_LINK`]).
+
+use std::f32::consts::PI;
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+use super::{Course, Gate, Point, Rules, Verdict, check_number, distance, either_side};
+use crate::robot::Robot;
+use crate::sim::{Scene, Snake};
+
+/// Settings of the task.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ShapeFormation {
+    /// Farthest that the middle of the shape lies from the middle of the snake at the start, units.
+    pub place: f32,
+    /// The shape's direction from tail to head lies within this angle to either side of the snake's at the start, degrees.
+    pub heading: f32,
+    /// Mean distance of the modules to their targets that counts as formed, units.
+    pub success_distance: f32,
+}
+
+impl Default for ShapeFormation {
+    fn default() -> Self {
+        ShapeFormation { place: 3.0, heading: 45.0, success_distance: 1.0 }
+    }
+}
+
+/// Kinds of shapes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Kind {
+    Line,
+    Arc,
+    C,
+    S,
+    U,
+    Ring,
+    Spiral,
+}
+
+impl Kind {
+    const ALL: [Kind; 7] = [Kind::Line, Kind::Arc, Kind::C, Kind::S, Kind::U, Kind::Ring, Kind::Spiral];
+
+    /// Least and most angle that the curve turns through, degrees.
+    fn bend(self) -> [f32; 2] {
+        match self {
+            Kind::Line => [0.0, 0.0],
+            Kind::Arc => [45.0, 110.0],
+            Kind::C => [150.0, 240.0],
+            Kind::S => [80.0, 150.0],
+            Kind::U => [160.0, 190.0],
+            Kind::Ring => [300.0, 320.0],
+            Kind::Spiral => [330.0, 400.0],
+        }
+    }
+
+    /// Share of the bend that is done at share `u` of the length, 0 to 1 both.
+    fn turned(self, u: f32) -> f32 {
+        match self {
+            Kind::Line | Kind::Arc | Kind::C | Kind::Ring => u,
+            // There and back again: the curvature changes its sign in the middle.
+            Kind::S => 1.0 - (2.0 * u - 1.0).abs(),
+            // Straight legs of a third each.
+            Kind::U => (3.0 * u - 1.0).clamp(0.0, 1.0),
+            // Tighter and tighter.
+            Kind::Spiral => 0.35 * u + 0.65 * u * u,
+        }
+    }
+}
+
+/// `count` points on a curve, `spacing` apart along it, from the origin along x.
+fn curve(kind: Kind, bend: f32, count: usize, spacing: f32) -> Vec<[f32; 2]> {
+    const FINE: usize = 32;
+    let length = (count - 1).max(1) as f32 * spacing;
+    let step = spacing / FINE as f32;
+    let mut at = [0.0f32; 2];
+    let mut points = vec![at];
+    for k in 0..(count - 1) * FINE {
+        let middle = (k as f32 + 0.5) * step / length;
+        let (sin, cos) = libm::sincosf(bend * kind.turned(middle));
+        at = [at[0] + step * cos, at[1] + step * sin];
+        if (k + 1) % FINE == 0 {
+            points.push(at);
+        }
+    }
+    points
+}
+
+impl ShapeFormation {
+    fn targets(kind: Kind, seed_rng: &mut ChaCha8Rng, robot: &Robot, place: f32, heading: f32) -> Vec<Point> {
+        let [least, most] = kind.bend();
+        let side = if seed_rng.random() { 1.0 } else { -1.0 };
+        let bend = side * (least + (most - least) * seed_rng.random::<f32>()).to_radians();
+        let spacing = robot.links_per_module as f32 * robot.link_length;
+        let points = curve(kind, bend, robot.modules, spacing);
+        let n = points.len() as f32;
+        let middle = [0, 1].map(|axis| points.iter().map(|p| p[axis]).sum::<f32>() / n);
+        // From the first point, the head's, to the last: against the snake's direction.
+        let (first, last) = (points[0], points[points.len() - 1]);
+        let chord = libm::atan2f(last[1] - first[1], last[0] - first[0]);
+        let turn = PI - chord + either_side(seed_rng, heading);
+        let (sin, cos) = libm::sincosf(turn);
+        let (away, bearing) = (place * libm::sqrtf(seed_rng.random::<f32>()), 2.0 * PI * seed_rng.random::<f32>());
+        let (by, bx) = libm::sincosf(bearing);
+        // The own link of the first module lies behind the head.
+        let own = composer_shared::robot::Geometry::OWN_LINK.min(robot.links_per_module - 1) as f32;
+        let snake_middle = -own * robot.link_length - 0.5 * (n - 1.0) * spacing;
+        points
+            .iter()
+            .map(|p| {
+                let [x, y] = [p[0] - middle[0], p[1] - middle[1]];
+                [snake_middle + away * bx + cos * x - sin * y, away * by + sin * x + cos * y, robot.link_radius]
+            })
+            .collect()
+    }
+}
+
+impl Rules for ShapeFormation {
+    fn validate(&self, robot: &Robot) -> Result<(), String> {
+        if robot.modules < 3 {
+            return Err(format!("{} modules cannot form a shape; at least 3 are needed", robot.modules));
+        }
+        check_number("place", self.place, [0.0, 50.0])?;
+        check_number("heading", self.heading, [0.0, 180.0])?;
+        check_number("success_distance", self.success_distance, [0.01, 100.0])
+    }
+
+    fn goal_radius(&self) -> f32 {
+        0.0
+    }
+
+    fn course(&self, seed: u64, robot: &Robot) -> Course {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let kind = Kind::ALL[rng.random_range(0..Kind::ALL.len())];
+        let marks = Self::targets(kind, &mut rng, robot, self.place, self.heading);
+        let n = marks.len() as f32;
+        let goal = [0, 1, 2].map(|axis| marks.iter().map(|p| p[axis]).sum::<f32>() / n);
+        Course { scene: Scene::default(), goal, marks }
+    }
+
+    fn point(&self, course: &Course, _snake: &Snake, number: u8) -> Option<Point> {
+        course.marks.get(usize::from(number)).copied()
+    }
+
+    fn verdict(&self, course: &Course, snake: &Snake, _gate: &mut Gate) -> Verdict {
+        let apart = course.marks.iter().enumerate().map(|(m, target)| distance(snake.module_position(m), *target));
+        let sum: f32 = apart.sum();
+        let mean = sum / course.marks.len().max(1) as f32;
+        Verdict { paper: -sum, left: sum, distance: mean, success: mean < self.success_distance }
+    }
+
+    fn imagined_distance(&self, course: &Course, _snake: &Snake, positions: &[Point]) -> f32 {
+        super::wasserstein(positions, &course.marks)
+    }
+}
