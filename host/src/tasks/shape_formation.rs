@@ -4,6 +4,7 @@
 //! |---|---|
 //! | start | straight, at rest, head at the origin, facing +x |
 //! | targets | one a module, a module's length apart along a curve: line, arc, C, S, U, ring or spiral, bent to either side; its middle up to `place` units from the snake's, turned by up to `heading` |
+//! | | targets lie at least 1.6 times the success distance from the modules, in the mean: the snake must move |
 //! | reward `paper` | `-sum_i d(module_i, target_i)` |
 //! | left to do (`progress`) | `sum_i d(module_i, target_i)` |
 //! | success | mean over the modules of `d(module_i, target_i)` < 1.25 units: the paper's sum is below `n d_g`; ends the episode |
@@ -21,6 +22,9 @@ use serde::{Deserialize, Serialize};
 use super::{Course, Gate, Point, Rules, Verdict, check_number, distance, either_side};
 use crate::robot::Robot;
 use crate::sim::{Scene, Snake};
+
+/// Targets lie at least this many times the success distance from the modules at the start, in the mean.
+const START_APART: f32 = 1.6;
 
 /// Settings of the task.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -111,6 +115,17 @@ fn curve(kind: Shape, bend: f32, count: usize, spacing: f32) -> Vec<[f32; 2]> {
     points
 }
 
+/// Where the modules are at the start.
+fn start_positions(robot: &Robot) -> Vec<Point> {
+    let own = composer_shared::robot::Geometry::OWN_LINK.min(robot.links_per_module - 1);
+    let link = |module: usize| (module * robot.links_per_module + own) as f32;
+    (0..robot.modules).map(|module| [-link(module) * robot.link_length, 0.0, robot.link_radius]).collect()
+}
+
+fn mean_distance(positions: &[Point], targets: &[Point]) -> f32 {
+    positions.iter().zip(targets).map(|(p, t)| distance(*p, *t)).sum::<f32>() / targets.len().max(1) as f32
+}
+
 impl ShapeFormation {
     fn targets(kind: Shape, seed_rng: &mut ChaCha8Rng, robot: &Robot, place: f32, heading: f32) -> Vec<Point> {
         let [least, most] = kind.bend();
@@ -127,9 +142,8 @@ impl ShapeFormation {
         let (sin, cos) = libm::sincosf(turn);
         let (away, bearing) = (place * libm::sqrtf(seed_rng.random::<f32>()), 2.0 * PI * seed_rng.random::<f32>());
         let (by, bx) = libm::sincosf(bearing);
-        // The own link of the first module lies behind the head.
-        let own = composer_shared::robot::Geometry::OWN_LINK.min(robot.links_per_module - 1) as f32;
-        let snake_middle = -own * robot.link_length - 0.5 * (n - 1.0) * spacing;
+        let start = start_positions(robot);
+        let snake_middle = 0.5 * (start[0][0] + start[start.len() - 1][0]);
         points
             .iter()
             .map(|p| {
@@ -159,8 +173,16 @@ impl Rules for ShapeFormation {
 
     fn course(&self, seed: u64, robot: &Robot) -> Course {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let kind = self.shapes[rng.random_range(0..self.shapes.len())];
-        let marks = Self::targets(kind, &mut rng, robot, self.place, self.heading);
+        let start = start_positions(robot);
+        // A shape that the straight snake has nearly got already is no task. A shape with a bend always comes within a few draws; lines
+        // alone with little room to be placed in never might.
+        let marks = (0..100)
+            .map(|_| {
+                let kind = self.shapes[rng.random_range(0..self.shapes.len())];
+                Self::targets(kind, &mut rng, robot, self.place, self.heading)
+            })
+            .find(|targets| mean_distance(&start, targets) >= START_APART * self.success_distance);
+        let marks = marks.unwrap_or_else(|| Self::targets(self.shapes[0], &mut rng, robot, self.place, self.heading));
         let n = marks.len() as f32;
         let goal = [0, 1, 2].map(|axis| marks.iter().map(|p| p[axis]).sum::<f32>() / n);
         Course { scene: Scene::default(), goal, marks }
@@ -171,9 +193,9 @@ impl Rules for ShapeFormation {
     }
 
     fn verdict(&self, course: &Course, snake: &Snake, _gate: &mut Gate) -> Verdict {
-        let apart = course.marks.iter().enumerate().map(|(m, target)| distance(snake.module_position(m), *target));
-        let sum: f32 = apart.sum();
-        let mean = sum / course.marks.len().max(1) as f32;
+        let positions: Vec<Point> = (0..snake.robot().modules).map(|m| snake.module_position(m)).collect();
+        let mean = mean_distance(&positions, &course.marks);
+        let sum = mean * course.marks.len() as f32;
         Verdict { paper: -sum, left: sum, distance: mean, success: mean < self.success_distance }
     }
 
