@@ -93,8 +93,8 @@ pub struct RunConfig {
 }
 
 impl RunConfig {
-    /// Changes one setting: `section.key=value`, or `key=value` where only one section has such a key. The value is TOML; a bare word
-    /// is a string.
+    /// Changes one setting: `section.key=value`, or `key=value` where only one section, or that of the task, has such a key. The value
+    /// is TOML; a bare word is a string.
     pub fn set(&mut self, assignment: &str) -> Result<()> {
         let Some((key, value)) = assignment.split_once('=') else {
             bail!("`{assignment}` is no setting: write key=value, such as train.learning_rate=3e-4");
@@ -108,6 +108,10 @@ impl RunConfig {
                     places.push((section.clone(), name.clone()));
                 }
             }
+        }
+        let of_task = self.task.name.name().replace('-', "_");
+        if places.len() > 1 && places.iter().any(|(section, _)| *section == of_task) {
+            places.retain(|(section, _)| *section == of_task);
         }
         let (section, name) = match &places[..] {
             [(section, name)] => (section.clone(), name.clone()),
@@ -229,6 +233,13 @@ mod tests {
         config.set("goal_known_to=head").unwrap();
         assert_eq!((config.train.learning_rate, config.goal_reaching.goal_distance), (1.0, [4.0, 15.0]));
         assert_eq!(config.env.goal_known_to, Knows::Head);
+        // The section of the task comes first.
+        config.set("name=block-pushing").unwrap();
+        config.set("goal_distance=[5, 6]").unwrap();
+        assert_eq!(config.block_pushing.goal_distance, [5.0, 6.0]);
+        assert!(config.set("name=dancing").unwrap_err().to_string().contains("no task `dancing`"));
+        config.set("task.name=shape-formation").unwrap();
+        assert!(config.set("goal_bearing=5").unwrap_err().to_string().contains("say which"));
         assert!(config.set("nonsense=1").unwrap_err().to_string().contains("no setting `nonsense`"));
         assert!(config.set("cap=-1").unwrap_err().to_string().contains("cap=-1 is not possible"));
         assert!(config.set("cap").unwrap_err().to_string().contains("key=value"));
