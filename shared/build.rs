@@ -1,4 +1,4 @@
-//! Sets `cfg(dsp)` where the processor has the DSP extension of ARMv7E-M. Rust's stable `target_feature` does not tell.
+//! Sets `cfg(dsp)` where the processor has the DSP extension of ARMv7E-M; Rust's stable `target_feature` does not tell.
 
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");

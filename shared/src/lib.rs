@@ -9,6 +9,7 @@
 extern crate std;
 
 pub mod kinematics;
+pub mod math;
 pub mod nn;
 pub mod observation;
 pub mod policies;
