@@ -141,6 +141,46 @@ impl<const IN: usize, const OUT: usize> Dense<'_, IN, OUT> {
     }
 }
 
+/// A vector of activations made ready for products with many int8 vectors: the query of the attention.
+#[cfg(not(dsp))]
+pub type Query<const N: usize> = PortableQuery<N>;
+/// A vector of activations made ready for products with many int8 vectors: the query of the attention.
+#[cfg(dsp)]
+pub type Query<const N: usize> = dsp::Query<N>;
+
+/// [`Query`] on any processor.
+#[derive(Clone, Copy, Debug)]
+pub struct PortableQuery<const N: usize>([i16; N]);
+
+impl<const N: usize> PortableQuery<N> {
+    /// Takes the vector; `N` is a multiple of 4 and at most 512.
+    pub fn new(query: &[i16; N]) -> Self {
+        const { assert!(N <= 512 && N.is_multiple_of(4), "the product could overflow, or is not of whole words") };
+        PortableQuery(*query)
+    }
+
+    /// The scalar product, at most `N * 2^22` in magnitude.
+    pub fn dot(&self, key: &[i8; N]) -> i32 {
+        self.0.iter().zip(key).map(|(&q, &k)| i32::from(q) * i32::from(k)).sum()
+    }
+}
+
+/// Adds the weighted sum of two int8 vectors; the caller sees to it that the sums do not overflow.
+pub fn add_weighted<const N: usize>(sums: &mut [i32; N], weights: [i16; 2], values: [&[i8; N]; 2]) {
+    const { assert!(N.is_multiple_of(4), "vectors are not whole words") };
+    #[cfg(dsp)]
+    dsp::add_weighted(sums, weights, values);
+    #[cfg(not(dsp))]
+    add_weighted_portable(sums, weights, values);
+}
+
+/// [`add_weighted`] on any processor.
+pub fn add_weighted_portable<const N: usize>(sums: &mut [i32; N], weights: [i16; 2], values: [&[i8; N]; 2]) {
+    for ((sum, &a), &b) in sums.iter_mut().zip(values[0]).zip(values[1]) {
+        *sum += i32::from(weights[0]) * i32::from(a) + i32::from(weights[1]) * i32::from(b);
+    }
+}
+
 /// Intervals of the table of [`tanh`] per unit of its argument.
 const TANH_STEPS: usize = 64;
 /// From here on [`tanh`] is 1.

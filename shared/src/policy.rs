@@ -651,19 +651,21 @@ impl<'a> Policy<'a> {
         let mask = heard | 1u64 << own_index;
         let latent = |j: usize| if j == own_index { &own.latent } else { latents.get(j).unwrap_or(&Latent::ZERO) };
         let mut logits = [0; MAX_MODULES];
+        let query = nn::Query::new(&own.query);
         for j in nn::ones(mask) {
             if let Some(logit) = logits.get_mut(j) {
-                *logit = dot(&own.query, &latent(j).key);
+                *logit = query.dot(&latent(j).key);
             }
         }
         let weights = nn::softmax(&logits, mask, self.softmax.0, self.softmax.1);
         // |sum| <= 128 * (32767 + 32), far from overflow.
-        let mut sums = [0i32; VALUE];
-        for j in nn::ones(mask) {
-            let weight = weights.get(j).map_or(0, |w| i32::from(*w));
-            for (sum, value) in sums.iter_mut().zip(latent(j).value) {
-                *sum += weight * i32::from(value);
-            }
+        let mut sums = [0; VALUE];
+        let mut modules = nn::ones(mask);
+        let weight = |j: usize| weights.get(j).map_or(0, |w| *w as i16);
+        while let Some(j) = modules.next() {
+            // Two at a time; the last of an odd number with nobody.
+            let (other, other_weight) = modules.next().map_or((j, 0), |other| (other, weight(other)));
+            nn::add_weighted(&mut sums, [weight(j), other_weight], [&latent(j).value, &latent(other).value]);
         }
         let context = sums.map(|sum| nn::saturate16((sum + (1 << (CONTEXT_SHIFT - 1))) >> CONTEXT_SHIFT));
         (context, weights)
@@ -673,11 +675,6 @@ impl<'a> Policy<'a> {
 /// The context is the weighted sum of values (Q15 weights times int8), shifted right by this: int8 value 1 becomes
 /// about 256.
 pub const CONTEXT_SHIFT: u32 = 7;
-
-/// |result| <= 16 * 32767 * 128, below 2^27.
-fn dot(query: &[i16; KEY], key: &[i8; KEY]) -> i32 {
-    query.iter().zip(key).map(|(&q, &k)| i32::from(q) * i32::from(k)).sum()
-}
 
 fn check_input(mean: f32, gain: f32) -> Result<(), PolicyError> {
     if !(-1e6..=1e6).contains(&mean) {

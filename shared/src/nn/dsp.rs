@@ -168,3 +168,39 @@ pub(super) fn accumulate<const IN: usize>(weights: &[[u8; IN]], input: &[i16; IN
         *sum = one_row(weights, &shuffled);
     }
 }
+
+/// [`super::PortableQuery`].
+pub struct Query<const N: usize>(Shuffled<N>);
+
+impl<const N: usize> Query<N> {
+    /// See [`super::PortableQuery::new`].
+    #[inline(always)]
+    pub fn new(query: &[i16; N]) -> Self {
+        const { assert!(N <= 512 && N.is_multiple_of(4), "the product could overflow, or is not of whole words") };
+        let mut shuffled = Shuffled([[0; 2]; N]);
+        shuffled.fill(query);
+        Query(shuffled)
+    }
+
+    /// See [`super::PortableQuery::dot`].
+    #[inline(always)]
+    pub fn dot(&self, key: &[i8; N]) -> i32 {
+        one_row(&key.map(|k| k as u8), &self.0)
+    }
+}
+
+/// [`super::add_weighted_portable`].
+#[inline(always)]
+pub(super) fn add_weighted<const N: usize>(sums: &mut [i32; N], weights: [i16; 2], values: [&[i8; N]; 2]) {
+    let weights = pair(weights[0], weights[1]);
+    let [a, b] = values.map(|values| values.as_chunks::<4>().0);
+    for ((sums, a), b) in sums.as_chunks_mut::<4>().0.iter_mut().zip(a).zip(b) {
+        let [a, b] = [a, b].map(|four| u32::from_le_bytes(four.map(|v| v as u8)));
+        let (a_even, b_even) = (sxtb16(a), sxtb16(b));
+        sums[0] = smlad(pkhbt(a_even, b_even), weights, sums[0]);
+        sums[2] = smlad(pkhtb(b_even, a_even), weights, sums[2]);
+        let (a_odd, b_odd) = (sxtb16_ror8(a), sxtb16_ror8(b));
+        sums[1] = smlad(pkhbt(a_odd, b_odd), weights, sums[1]);
+        sums[3] = smlad(pkhtb(b_odd, a_odd), weights, sums[3]);
+    }
+}
