@@ -667,7 +667,10 @@ impl<'a> Policy<'a> {
             let (other, other_weight) = modules.next().map_or((j, 0), |other| (other, weight(other)));
             nn::add_weighted(&mut sums, [weight(j), other_weight], [&latent(j).value, &latent(other).value]);
         }
-        let context = sums.map(|sum| nn::saturate16((sum + (1 << (CONTEXT_SHIFT - 1))) >> CONTEXT_SHIFT));
+        let mut context = [0; VALUE];
+        for (context, sum) in context.iter_mut().zip(sums) {
+            *context = nn::saturate16((sum + (1 << (CONTEXT_SHIFT - 1))) >> CONTEXT_SHIFT);
+        }
         (context, weights)
     }
 }
