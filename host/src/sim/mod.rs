@@ -41,6 +41,18 @@ pub struct Motion {
     pub peak_joint_speed: f32,
 }
 
+/// A loaded contact of the snake.
+struct Contact {
+    /// The links on both sides; none is the ground or a solid.
+    links: [Option<usize>; 2],
+    /// Where, in the world.
+    point: Vector,
+    /// Its normal, of length 1.
+    normal: Vector,
+    /// Normal force.
+    load: f32,
+}
+
 /// The snake and its scene.
 pub struct Snake {
     robot: Robot,
@@ -52,6 +64,9 @@ pub struct Snake {
     torque: Vec<[f32; AXES]>,
     command: Vec<[f32; AXES]>,
     motion: Motion,
+    contacts: Vec<Contact>,
+    /// Sum of the loads of a link's contacts.
+    loads: Vec<f32>,
 }
 
 /// Collision groups: one bit for the scene, 31 that the modules share in turn. A link meets the scene and the links of
@@ -80,6 +95,9 @@ impl Snake {
         parameters.num_solver_iterations = robot.solver_iterations;
         parameters.num_internal_stabilization_iterations = 0;
         parameters.max_ccd_substeps = 0;
+        // The joints start each step from nothing. Contacts that start from their last impulses in full push harder than the chain
+        // holds, and a link held from two sides shakes itself to pieces; contacts that start from nothing let a block creep.
+        parameters.warmstart_coefficient = 0.7;
         parameters.contact_clustering = false;
         world.colliders.insert(
             ColliderBuilder::halfspace(rapier3d::na::Unit::new_unchecked(Vector::Z))
@@ -133,6 +151,8 @@ impl Snake {
             torque: vec![[0.0; AXES]; robot.modules],
             command: vec![[0.0; AXES]; robot.modules],
             motion: Motion::default(),
+            contacts: Vec::new(),
+            loads: vec![0.0; robot.links()],
         }
     }
 
@@ -187,64 +207,69 @@ impl Snake {
     }
 
     /// Anisotropic Coulomb friction from the contacts of the last step: in the plane of each contact, opposed to the sliding of
-    /// the link's contact point, with one coefficient along the link and another across it. The force that would stop the
-    /// link within the step is its upper bound, so that friction never drives.
+    /// the link's contact point, with one coefficient along the link and another across it. All contacts of a link together can at
+    /// most stop it within the step, so that friction never drives.
     fn apply_friction(&mut self) {
         for &link in &self.links {
             let body = &mut self.world.bodies[link];
             body.reset_forces(false);
             body.reset_torques(false);
         }
-        let dt = self.robot.physics_step;
+        self.find_contacts();
         let (along, across) = (self.robot.friction_along, self.robot.friction_across);
+        let per_load = across * self.robot.physics_step / self.robot.link_mass;
+        for contact in &self.contacts {
+            let [one, two] = contact.links.map(|link| link.map(|l| self.links[l]));
+            let velocity = |body: Option<RigidBodyHandle>| {
+                body.map_or(Vector::ZERO, |b| self.world.bodies[b].velocity_at_point(contact.point))
+            };
+            let Some(link) = two.or(one) else { continue };
+            let normal = contact.normal;
+            let sliding = velocity(two) - velocity(one);
+            let sliding = sliding - normal * sliding.dot(normal);
+            let axis = self.world.bodies[link].rotation() * Vector::X;
+            let axial = (axis - normal * axis.dot(normal)).normalize_or_zero();
+            let v_along = axial * sliding.dot(axial);
+            let v_across = sliding - v_along;
+            let speed = sliding.length();
+            // The change of the sliding speed in a step if every contact of the links had its full friction.
+            let stopping: f32 = contact.links.iter().flatten().map(|l| self.loads[*l] * per_load).sum();
+            let scale = contact.load / speed.max(STILL_SPEED).max(stopping);
+            let force = -(v_along * along + v_across * across) * scale;
+            if let Some(two) = two {
+                self.world.bodies[two].add_force_at_point(force, contact.point, false);
+            }
+            if let Some(one) = one {
+                self.world.bodies[one].add_force_at_point(-force, contact.point, false);
+            }
+        }
+    }
+
+    /// The snake's loaded contacts of the last step with ground, solids and itself, and the load on each link. Those with the block
+    /// have rapier's friction.
+    fn find_contacts(&mut self) {
+        let dt = self.robot.physics_step;
+        self.contacts.clear();
+        self.loads.fill(0.0);
         for pair in self.world.narrow_phase.contact_pairs() {
-            // The block has rapier's friction.
-            if self.block.is_some() && [pair.collider1, pair.collider2].into_iter().any(|c| self.is_block(c)) {
+            let colliders = [pair.collider1, pair.collider2].map(|handle| &self.world.colliders[handle]);
+            let parents = colliders.map(Collider::parent);
+            if self.block.is_some() && parents.contains(&self.block) {
                 continue;
             }
+            let links = [0, 1].map(|side| parents[side].map(|_| colliders[side].user_data as usize));
             for manifold in pair.solver_manifolds() {
                 let load: f32 = manifold.points.iter().map(|p| p.data.impulse).sum::<f32>() / dt;
                 if load <= 0.0 {
                     continue;
                 }
                 // The frame of the first collider carries the contact point; impulses weigh the points of a line contact.
-                let position1 = self.world.colliders[pair.collider1].position();
                 let weighted: Vector = manifold.points.iter().map(|p| p.local_p1 * p.data.impulse).sum();
-                let point = position1.transform_point(weighted / (load * dt));
-                let normal = manifold.data.normal;
-                let of = |collider: ColliderHandle| {
-                    let parent = self.world.colliders[collider].parent()?;
-                    let body = &self.world.bodies[parent];
-                    body.is_dynamic().then_some(parent)
-                };
-                let (one, two) = (of(pair.collider1), of(pair.collider2));
-                let velocity = |body: Option<RigidBodyHandle>| {
-                    body.map_or(Vector::ZERO, |b| self.world.bodies[b].velocity_at_point(point))
-                };
-                let Some(link) = two.or(one) else { continue };
-                let sliding = velocity(two) - velocity(one);
-                let sliding = sliding - normal * sliding.dot(normal);
-                let body = &self.world.bodies[link];
-                let axis = body.rotation() * Vector::X;
-                let axial = (axis - normal * axis.dot(normal)).normalize_or_zero();
-                let v_along = axial * sliding.dot(axial);
-                let v_across = sliding - v_along;
-                let speed = sliding.length();
-                let stopping = across * load * dt / body.mass();
-                let scale = load / speed.max(STILL_SPEED).max(stopping);
-                let force = -(v_along * along + v_across * across) * scale;
-                if let Some(two) = two {
-                    self.world.bodies[two].add_force_at_point(force, point, false);
-                }
-                if let Some(one) = one {
-                    self.world.bodies[one].add_force_at_point(-force, point, false);
-                }
+                let point = colliders[0].position().transform_point(weighted / (load * dt));
+                links.iter().flatten().for_each(|link| self.loads[*link] += load);
+                self.contacts.push(Contact { links, point, normal: manifold.data.normal, load });
             }
         }
-    }
-
-    fn is_block(&self, collider: ColliderHandle) -> bool {
-        self.block.is_some() && self.world.colliders[collider].parent() == self.block
     }
 
     /// Position and rotation (quaternion x, y, z, w) of the block, if there is one.
@@ -358,7 +383,7 @@ impl Snake {
         self.links.iter().map(|&l| self.world.bodies[l].translation().z).fold(0.0, f32::max)
     }
 
-    /// Kinetic plus potential energy (gravity and joint springs), for tests of the physics.
+    /// Kinetic plus potential energy (gravity and joint springs) of snake and block, for tests of the physics.
     pub fn energy(&self) -> f32 {
         let bodies = self.links.iter().map(|&l| &self.world.bodies[l]);
         let moving: f32 = bodies
@@ -370,7 +395,11 @@ impl Snake {
             .sum();
         let springs: f32 =
             (0..self.joints.len()).map(|j| 0.5 * self.robot.stiffness * self.joint_angle(j).powi(2)).sum();
-        moving + springs
+        let block = self.block.map_or(0.0, |block| {
+            let body = &self.world.bodies[block];
+            body.kinetic_energy() + body.mass() * self.robot.gravity * body.translation().z
+        });
+        moving + springs + block
     }
 
     /// Largest distance between the two halves of a joint, units: how far the solver let the chain come apart.

@@ -83,3 +83,178 @@ impl Scene {
         Some(handle)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::Snake;
+    use super::*;
+    use crate::robot::Robot;
+
+    const BLOCK: Block =
+        Block { half: [0.75, 0.75, 0.5], position: [3.0, 0.0, 0.5], yaw: 0.3, mass: 0.01, friction: 0.5 };
+
+    fn wall(position: [f32; 3], half: [f32; 3]) -> Scene {
+        Scene { solids: vec![Solid { half, position, yaw: 0.0, roll: 0.0 }], block: None }
+    }
+
+    fn body(snake: &mut Snake, handle: RigidBodyHandle) -> &mut RigidBody {
+        &mut snake.world.bodies[handle]
+    }
+
+    /// Moves the whole snake.
+    fn shift(snake: &mut Snake, by: Vector) {
+        for link in snake.links.clone() {
+            let place = body(snake, link).translation() + by;
+            body(snake, link).set_translation(place, true);
+        }
+    }
+
+    /// Sets the velocity of every link.
+    fn throw(snake: &mut Snake, velocity: Vector) {
+        for link in snake.links.clone() {
+            body(snake, link).set_linvel(velocity, true);
+        }
+    }
+
+    /// Two seconds with the motors off. The energy never rises above what it was within the last quarter of a second, for so long the
+    /// solver's give in joints and contacts can keep it, by more than half a percent; returns the share left.
+    fn energy_falls(snake: &mut Snake) -> f32 {
+        (0..snake.robot().modules).for_each(|module| snake.set_torque(module, [0.0; 2]));
+        // Until the slew has brought the torques down.
+        while (0..snake.robot().modules).any(|module| snake.torque(module) != [0.0; 2]) {
+            snake.step();
+        }
+        let rest = Snake::new(snake.robot()).energy();
+        let mut energy = vec![snake.energy()];
+        for step in 0..40 {
+            (0..5).for_each(|_| snake.step());
+            let before = energy.iter().rev().take(5).fold(0.0, |a: f32, b| a.max(*b));
+            energy.push(snake.energy());
+            assert!(snake.energy() <= before + 0.005 * energy[0], "step {step}: {energy:?}");
+        }
+        assert!(snake.energy() > 0.9 * rest, "the snake has sunk: {energy:?}");
+        snake.energy() / energy[0]
+    }
+
+    #[test]
+    fn energy_does_not_grow_with_the_motors_off_against_walls_and_blocks() {
+        let robot = Robot::default();
+        // Thrown at a wall, head first and sideways.
+        for (scene, velocity) in [
+            (wall([1.5, 0.0, 1.0], [0.5, 20.0, 1.0]), Vector::new(20.0, 0.0, 0.0)),
+            (wall([0.0, 1.5, 1.0], [40.0, 0.5, 1.0]), Vector::new(0.0, 20.0, 0.0)),
+            // A block, and a block with a wall behind it.
+            (Scene { block: Some(BLOCK), ..Scene::default() }, Vector::new(20.0, 0.0, 0.0)),
+            (Scene { block: Some(BLOCK), ..wall([4.6, 0.0, 1.0], [0.5, 20.0, 1.0]) }, Vector::new(20.0, 0.0, 0.0)),
+        ] {
+            let mut snake = Snake::in_scene(&robot, &scene);
+            throw(&mut snake, velocity);
+            let left = energy_falls(&mut snake);
+            assert!(left < 0.95, "{left}");
+        }
+        // Pressed against a wall at full torque, then let go.
+        let mut snake = Snake::in_scene(&robot, &wall([-8.0, 1.0, 1.0], [10.0, 0.5, 1.0]));
+        (0..8).for_each(|module| snake.set_torque(module, [if module % 2 == 0 { 80.0 } else { -80.0 }, 40.0]));
+        (0..100).for_each(|_| snake.step());
+        energy_falls(&mut snake);
+        // Dropped across a wall and onto a block.
+        for scene in [
+            wall([-8.0, 0.0, 0.5], [0.5, 5.0, 0.5]),
+            Scene { block: Some(Block { position: [-5.0, 0.0, 0.5], ..BLOCK }), ..Scene::default() },
+        ] {
+            let mut snake = Snake::in_scene(&robot, &scene);
+            shift(&mut snake, Vector::new(0.0, 0.0, 2.0));
+            energy_falls(&mut snake);
+        }
+    }
+
+    #[test]
+    fn friction_on_a_solid_is_that_of_the_contacts_own_load_and_normal() {
+        let robot = Robot::default();
+        // Speed lost in 0.1 s along and across the links, by a snake that a sideways pull presses against what is beside it.
+        let lost = |scene: &Scene, pull: f32, velocity: Vector| {
+            let mut snake = Snake::in_scene(&robot, scene);
+            snake.world.gravity.y = pull;
+            (0..20).for_each(|_| snake.step());
+            throw(&mut snake, velocity);
+            (0..10).for_each(|_| snake.step());
+            let mean = snake.links.iter().map(|l| snake.world.bodies[*l].linvel().length()).sum::<f32>() / 32.0;
+            velocity.length() - mean
+        };
+        let g = 0.1 * robot.gravity;
+        let near = |got: f32, want: f32| assert!((got - want).abs() < 0.05 * want, "{got} instead of {want}");
+        let plain = Scene::default();
+        near(lost(&plain, 0.0, Vector::new(30.0, 0.0, 0.0)), g * robot.friction_along);
+        // A wall takes the pull, and adds its own friction to the ground's.
+        let beside = wall([-8.0, 0.9 + 1e-3, 5.0], [20.0, 0.5, 5.0]);
+        near(lost(&beside, robot.gravity, Vector::new(30.0, 0.0, 0.0)), 2.0 * g * robot.friction_along);
+        // Up along the wall: across the links, and gravity, and nothing from the ground.
+        near(lost(&beside, robot.gravity, Vector::new(0.0, 0.0, 60.0)), g * (1.0 + robot.friction_across));
+        // On top of a solid as on the ground.
+        let floor = wall([-8.0, 0.0, -0.5], [20.0, 20.0, 0.5 + 1e-3]);
+        near(lost(&floor, 0.0, Vector::new(0.0, 30.0, 0.0)), g * robot.friction_across);
+    }
+
+    #[test]
+    fn friction_never_drives_and_a_snake_held_tight_comes_to_rest() {
+        let robot = Robot { friction_along: 1.0, ..Robot::default() };
+        for tight in [0.0, 0.005, 0.02] {
+            // In a groove: ground and a wall on either side.
+            let mut scene = wall([-8.0, 0.9 - tight, 1.0], [20.0, 0.5, 1.0]);
+            scene.solids.push(Solid { position: [-8.0, -0.9 + tight, 1.0], ..scene.solids[0] });
+            let mut snake = Snake::in_scene(&robot, &scene);
+            throw(&mut snake, Vector::new(1.0, 0.0, 0.0));
+            for step in 0..200 {
+                snake.step();
+                let speeds = snake.links.iter().map(|l| snake.world.bodies[*l].linvel());
+                let (back, fastest) = speeds.fold((0.0f32, 0.0f32), |(b, f), v| (b.max(-v.x), f.max(v.length())));
+                assert!(back < 0.1 && fastest < 1.1, "{tight}, step {step}: {fastest}, back {back}");
+                assert!(step < 150 || fastest < 0.02, "{tight}, step {step}: {fastest}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_block_at_rest_stays_at_rest_while_the_snake_moves_elsewhere() {
+        for (torque, yaw) in [(0.0, 0.3), (80.0, 0.0), (80.0, 1.2)] {
+            let block = Block { position: [12.0, 8.0, 0.5], yaw, ..BLOCK };
+            let mut snake = Snake::in_scene(&Robot::default(), &Scene { block: Some(block), ..Scene::default() });
+            let (start, _) = snake.block().unwrap();
+            let mut rests = snake.block().unwrap();
+            for step in 0..125 {
+                (0..8).for_each(|m| snake.set_torque(m, [torque * libm::sinf(0.2 * step as f32 + m as f32), 0.0]));
+                (0..5).for_each(|_| snake.step());
+                let (position, rotation) = snake.block().unwrap();
+                // Its weight has settled on the ground.
+                if step == 10 {
+                    rests = (position, rotation);
+                }
+                let off = |from: [f32; 3], axis: usize| (position[axis] - from[axis]).abs();
+                assert!(
+                    off(start, 0) < 2e-3 && off(start, 1) < 2e-3 && off(start, 2) < 5e-3,
+                    "step {step}: {position:?}"
+                );
+                let moved = (0..3).map(|axis| off(rests.0, axis)).fold(0.0, f32::max);
+                let turned = (0..4).map(|axis| (rotation[axis] - rests.1[axis]).abs()).fold(0.0, f32::max);
+                assert!(step < 10 || moved < 1e-4 && turned < 1e-4, "step {step}: {position:?} {rotation:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_block_pushed_and_let_go_slides_to_a_stop_by_its_friction() {
+        for friction in [0.2, 0.5, 1.0] {
+            let block = Block { position: [5.0, 0.0, 0.5], yaw: 0.0, friction, ..BLOCK };
+            let mut snake = Snake::in_scene(&Robot::default(), &Scene { block: Some(block), ..Scene::default() });
+            (0..20).for_each(|_| snake.step());
+            let handle = snake.block.unwrap();
+            body(&mut snake, handle).set_linvel(Vector::new(10.0, 0.0, 0.0), true);
+            (0..150).for_each(|_| snake.step());
+            let ([x, y, z], _) = snake.block().unwrap();
+            let way = 10.0f32.powi(2) / (2.0 * friction * 196.2);
+            assert!((x - 5.0 - way).abs() < 0.1 * way + 0.06, "friction {friction}: {} instead of {way}", x - 5.0);
+            assert!(y.abs() < 0.02 && (z - 0.5).abs() < 0.01, "{y} {z}");
+            assert!(body(&mut snake, handle).linvel().length() < 1e-3);
+        }
+    }
+}

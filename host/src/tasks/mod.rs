@@ -13,6 +13,9 @@ pub mod shape_formation;
 pub mod tube_crossing;
 pub mod wall_climbing;
 
+#[cfg(test)]
+mod soundness;
+
 use composer_shared::policy::Task;
 use pathfinding::kuhn_munkres::kuhn_munkres_min;
 use pathfinding::matrix::Matrix;
@@ -141,8 +144,10 @@ pub enum Gate {
     /// On this side: not in the tube.
     #[default]
     Before,
-    /// In it.
+    /// In it, through its entrance.
     Inside,
+    /// In it, from the wrong end.
+    Astray,
     /// Through.
     Passed,
 }

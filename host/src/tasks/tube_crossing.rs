@@ -11,6 +11,8 @@
 //! | points on the bus | 0: the goal, 1: the entrance's centre, 2: the middle of the tube's centre line |
 //! | imagined distance | mean over the modules of the way left from `p'_i` |
 
+use std::f32::consts::PI;
+
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -102,7 +104,14 @@ impl TubeCrossing {
         place(course, self.tube_width, self.tube_height, p)
     }
 
-    fn length(course: &Course) -> f32 {
+    /// Place of a point along the centre line, units, and whether it is within walls and roof.
+    #[cfg(test)]
+    pub(super) fn seen_from(&self, course: &Course, p: Point) -> (f32, bool) {
+        let place = self.place(course, p);
+        (place.along, place.within)
+    }
+
+    pub(super) fn length(course: &Course) -> f32 {
         course.marks.windows(2).map(|ends| distance(ends[0], ends[1])).sum()
     }
 
@@ -111,43 +120,64 @@ impl TubeCrossing {
         match gate {
             Gate::Passed => distance(p, course.goal),
             Gate::Inside => (Self::length(course) - self.place(course, p).along).max(0.0) + self.goal_beyond,
-            Gate::Before => distance(p, course.marks[0]) + Self::length(course) + self.goal_beyond,
+            Gate::Before | Gate::Astray => distance(p, course.marks[0]) + Self::length(course) + self.goal_beyond,
         }
     }
 
+    /// The panels of the tube: two walls, two bevels and a roof for each piece of the centre line. Inner faces meet edge to edge.
     fn solids(&self, marks: &[Point]) -> Vec<Solid> {
-        let (width, height, bevel) = (self.tube_width, self.tube_height, BEVEL * self.tube_width);
+        let (width, height) = (self.tube_width, self.tube_height);
+        let bevel = BEVEL * width.min(height);
+        let pieces: Vec<_> = marks.windows(2).map(|ends| (ends[0], ends[1])).collect();
+        let yaw = |k: usize| {
+            let (a, b) = pieces[k];
+            libm::atan2f(b[1] - a[1], b[0] - a[0])
+        };
+        // Half the turn to the left at the joint of two pieces, as its tangent.
+        let turn = |k: usize| libm::tanf(0.5 * wrapped(yaw(k + 1) - yaw(k)));
         let mut solids = Vec::new();
-        for ends in marks.windows(2) {
-            let [a, b] = [ends[0], ends[1]];
-            let yaw = libm::atan2f(b[1] - a[1], b[0] - a[0]);
+        for (k, (a, b)) in pieces.iter().enumerate() {
+            let yaw = yaw(k);
             let (sin, cos) = libm::sincosf(yaw);
-            // Long enough that no gap opens on the outside of a bend.
-            let bend = self.tube_bend.to_radians() / PIECES as f32;
-            let half_length = 0.5 * distance(a, b) + (0.5 * width + THICKNESS) * libm::tanf(0.5 * bend);
-            let middle = [0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1])];
-            // A panel whose inner face has its middle at (y, z) and faces back along (-ny, -nz).
-            let mut panel = |y: f32, z: f32, half_width: f32, roll: f32| {
+            let length = libm::hypotf(b[0] - a[0], b[1] - a[1]);
+            let turns = [if k > 0 { turn(k - 1) } else { 0.0 }, if k + 1 < pieces.len() { turn(k) } else { 0.0 }];
+            // A panel whose inner face has its middle at (y, z), spans `edges` (y), and faces back along -(cos, sin) of `roll`. It is
+            // as long as face and back need to meet those of the next piece, on the inside of a bend shorter than the centre line.
+            let mut panel = |[y, z]: [f32; 2], edges: [f32; 2], half_width: f32, roll: f32| {
                 let (nz, ny) = libm::sincosf(roll);
-                let (y, z) = (y + 0.5 * THICKNESS * ny, z + 0.5 * THICKNESS * nz);
+                let back = THICKNESS * ny;
+                let [before, beyond] = turns.map(|turn| {
+                    let over = edges.iter().flat_map(|edge| [-turn * edge, -turn * (edge + back)]);
+                    over.fold(f32::NEG_INFINITY, f32::max)
+                });
+                let (x, y, z) = (0.5 * (length + beyond - before), y + 0.5 * back, z + 0.5 * THICKNESS * nz);
                 solids.push(Solid {
-                    half: [half_length, 0.5 * THICKNESS, half_width],
-                    position: [middle[0] - sin * y, middle[1] + cos * y, z],
+                    half: [0.5 * (length + before + beyond), 0.5 * THICKNESS, half_width],
+                    position: [a[0] + cos * x - sin * y, a[1] + sin * x + cos * y, z],
                     yaw,
                     roll,
                 });
             };
-            let wall = height - bevel;
+            let (half, wall) = (0.5 * width, height - bevel);
+            let (eighth, quarter) = (0.25 * PI, 0.5 * PI);
+            // Their backs meet too.
+            let mitre = THICKNESS * libm::tanf(0.5 * eighth);
             for side in [1.0f32, -1.0] {
-                let out = if side > 0.0 { 0.0 } else { std::f32::consts::PI };
-                let up = if side > 0.0 { 0.25 * std::f32::consts::PI } else { 0.75 * std::f32::consts::PI };
-                panel(side * 0.5 * width, 0.5 * wall, 0.5 * wall, out);
-                panel(side * 0.5 * (width - bevel), height - 0.5 * bevel, std::f32::consts::FRAC_1_SQRT_2 * bevel, up);
+                let (out, up) = if side > 0.0 { (0.0, eighth) } else { (PI, PI - eighth) };
+                let (outer, inner) = (side * half, side * (half - bevel));
+                panel([outer, 0.5 * (wall + mitre)], [outer, outer], 0.5 * (wall + mitre), out);
+                let slope = std::f32::consts::FRAC_1_SQRT_2 * bevel + mitre;
+                panel([0.5 * (outer + inner), height - 0.5 * bevel], [outer, inner], slope, up);
             }
-            panel(0.0, height, 0.5 * width - bevel, 0.5 * std::f32::consts::PI);
+            panel([0.0, height], [half, -half], half - bevel + mitre, quarter);
         }
         solids
     }
+}
+
+/// An angle as one from -pi to pi.
+fn wrapped(angle: f32) -> f32 {
+    libm::remainderf(angle, 2.0 * PI)
 }
 
 impl Rules for TubeCrossing {
@@ -215,15 +245,21 @@ impl Rules for TubeCrossing {
         let (place, length) = (self.place(course, head), Self::length(course));
         let inside = place.within && (0.0..=length).contains(&place.along);
         *gate = match *gate {
-            // From the front: who slips in from behind has not crossed it.
-            Gate::Before if inside && place.along < 0.25 * length => Gate::Inside,
-            Gate::Inside if inside => Gate::Inside,
+            // Who slips in from behind has not crossed it, wherever it comes out.
+            Gate::Before if inside => {
+                if place.along < 0.5 * length {
+                    Gate::Inside
+                } else {
+                    Gate::Astray
+                }
+            }
+            Gate::Inside | Gate::Astray if inside => *gate,
             Gate::Inside if place.along > length => Gate::Passed,
             Gate::Passed => Gate::Passed,
             _ => Gate::Before,
         };
         let to_goal = distance(head, course.goal);
-        let to_tube = if *gate == Gate::Before { distance(head, course.marks[0]) } else { 0.0 };
+        let to_tube = if matches!(gate, Gate::Before | Gate::Astray) { distance(head, course.marks[0]) } else { 0.0 };
         Verdict {
             paper: -to_tube - to_goal,
             left: self.left(course, head, *gate),
