@@ -77,12 +77,7 @@ fn scale(sums: &mut [i32], multipliers: &[[u8; 4]], bias: Option<&[[u8; 4]]>, sh
 }
 
 #[inline(always)]
-fn scale_by(
-    sums: &mut [i32],
-    multipliers: &[[u8; 4]],
-    bias: Option<&[[u8; 4]]>,
-    requantise: impl Fn(i32, i32) -> i32,
-) {
+fn scale_by(sums: &mut [i32], multipliers: &[[u8; 4]], bias: Option<&[[u8; 4]]>, requantise: impl Fn(i32, i32) -> i32) {
     let sums = sums.iter_mut().zip(multipliers.iter().map(|m| i32::from_le_bytes(*m)));
     if let Some(bias) = bias {
         for ((sum, multiplier), bias) in sums.zip(bias) {

@@ -1,9 +1,9 @@
 //! The kernels of the processor give the host's bits: random inputs with the host's results, compared on the emulated Cortex-M4F.
 
-#[path = "../../firmware/src/bin/qemu_vectors/cases.rs"]
-mod cases;
 #[path = "common/arm.rs"]
 mod arm;
+#[path = "../../firmware/src/bin/qemu_vectors/cases.rs"]
+mod cases;
 
 use cases::{ADDRESS, CAPACITY, MAGIC, Side};
 use rand::{Rng, RngExt, SeedableRng};

@@ -152,7 +152,10 @@ fn dense(random: &mut Random) {
     let layer = Dense { weights: &weights, multipliers: &multipliers, bias: Some(&bias), shift: 37 };
     let mut out = [0; 64];
     report(format_args!("dense64/dsp"), count(|| black_box(&layer).forward(black_box(&input), black_box(&mut out))));
-    report(format_args!("dense64/portable"), count(|| black_box(&layer).forward_portable(black_box(&input), black_box(&mut out))));
+    report(
+        format_args!("dense64/portable"),
+        count(|| black_box(&layer).forward_portable(black_box(&input), black_box(&mut out))),
+    );
 }
 
 fn latent_message(policy: &Policy<'_>, cycle: u8, latent: Latent) -> LatentMessage {
@@ -192,11 +195,12 @@ fn control_steps(policy: Policy<'_>, modules: u8, random: &mut Random) {
         for module in 0..node {
             put(Message::Latent(latent_message(&policy, low, random.latent())), module);
         }
-        let instructions = TICK * ticks(|| {
-            for (i, frame) in frames.iter().take(received).enumerate() {
-                step(&mut controller, now + i as u64, &sensors, frame);
-            }
-        });
+        let instructions = TICK
+            * ticks(|| {
+                for (i, frame) in frames.iter().take(received).enumerate() {
+                    step(&mut controller, now + i as u64, &sensors, frame);
+                }
+            });
         if cycle >= JOINING {
             sum += u64::from(instructions);
             most = most.max(instructions);

@@ -27,7 +27,9 @@ fn sxtb16_ror8(x: u32) -> u32 {
 fn pkhbt(low: u32, high: u32) -> u32 {
     let y;
     // SAFETY: an instruction on registers.
-    unsafe { asm!("pkhbt {}, {}, {}, lsl #16", lateout(reg) y, in(reg) low, in(reg) high, options(pure, nomem, nostack, preserves_flags)) }
+    unsafe {
+        asm!("pkhbt {}, {}, {}, lsl #16", lateout(reg) y, in(reg) low, in(reg) high, options(pure, nomem, nostack, preserves_flags))
+    }
     y
 }
 
@@ -36,7 +38,9 @@ fn pkhbt(low: u32, high: u32) -> u32 {
 fn pkhtb(high: u32, low: u32) -> u32 {
     let y;
     // SAFETY: an instruction on registers.
-    unsafe { asm!("pkhtb {}, {}, {}, asr #16", lateout(reg) y, in(reg) high, in(reg) low, options(pure, nomem, nostack, preserves_flags)) }
+    unsafe {
+        asm!("pkhtb {}, {}, {}, asr #16", lateout(reg) y, in(reg) high, in(reg) low, options(pure, nomem, nostack, preserves_flags))
+    }
     y
 }
 

@@ -9,7 +9,10 @@ const TARGET: &str = "thumbv7em-none-eabihf";
 
 /// The linked image of a program of the firmware, built if it is not up to date.
 pub fn image(program: &str, features: &str) -> PathBuf {
-    let manifest = Path::new(env!("CARGO_MANIFEST_DIR")).join("../firmware/Cargo.toml").canonicalize().expect("the firmware is beside the tests");
+    let manifest = Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../firmware/Cargo.toml")
+        .canonicalize()
+        .expect("the firmware is beside the tests");
     let output = Command::new(env!("CARGO"))
         .args(["build", "--release", "--quiet", "--message-format=json", "--target", TARGET])
         .args(["--bin", program, "--features", features, "--manifest-path"])

@@ -47,7 +47,8 @@ impl Image {
             if sh_flags & u64::from(elf::SHF_ALLOC) == 0 {
                 continue;
             }
-            let (writable, stored) = (sh_flags & u64::from(elf::SHF_WRITE) != 0, section.kind() != SectionKind::UninitializedData);
+            let (writable, stored) =
+                (sh_flags & u64::from(elf::SHF_WRITE) != 0, section.kind() != SectionKind::UninitializedData);
             flash += if stored { section.size() } else { 0 };
             ram += if writable { section.size() } else { 0 };
         }
@@ -76,7 +77,8 @@ impl Image {
             let next = ends.get(i).copied().unwrap_or(start + 2);
             let end = if *size == 0 { next } else { start + size };
             let section = file.sections().find(|s| (s.address()..s.address() + s.size()).contains(&start.into()));
-            let code = section.and_then(|s| s.data_range(start.into(), (end - start).into()).ok().flatten()).unwrap_or(&[]);
+            let code =
+                section.and_then(|s| s.data_range(start.into(), (end - start).into()).ok().flatten()).unwrap_or(&[]);
             functions.insert(start, function(name.clone(), start, code, &marks));
         }
         Image { flash, ram, functions }

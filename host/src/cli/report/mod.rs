@@ -82,7 +82,7 @@ impl What {
     fn methods(self) -> Vec<Method> {
         match self {
             What::Attention => vec![Method::Mappo, Method::ComposerNoImagination],
-            What::Ablation => vec![Method::ComposerNoImagination, Method::ComposerNoImagination],
+            What::Ablation => vec![Method::Composer, Method::ComposerNoImagination, Method::ComposerNoAttention],
         }
     }
 
@@ -142,8 +142,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     publish(what, &runs, arguments, &out)?;
     if what == What::Ablation {
         for task in [Task::GoalReaching, Task::WallClimbing, Task::TubeCrossing] {
-            let complete =
-                |run: &&Run| run.config.task.name == task && run.config.train.method == Method::ComposerNoImagination;
+            let complete = |run: &&Run| run.config.task.name == task && run.config.train.method == Method::Composer;
             let Some(run) = runs.iter().find(complete) else { continue };
             let (config, network) = load_run(&run.folder)?;
             let path = out.join(format!("attention-{task}.svg"));
