@@ -20,6 +20,10 @@ pub struct SnakePlant {
     low_steps: u32,
     distance: f32,
     success: bool,
+    /// What the motors get now, by its bits.
+    torques: Vec<[u32; AXES]>,
+    /// The same of every physics step so far, module by module, if it is kept.
+    trace: Option<Vec<[u32; AXES]>>,
 }
 
 impl SnakePlant {
@@ -27,10 +31,30 @@ impl SnakePlant {
     pub fn new(config: Arc<EnvConfig>, seed: u64) -> Self {
         let snake = Snake::new(&config.robot);
         let goal = config.task.goal(seed, config.robot.link_radius);
-        let mut plant =
-            SnakePlant { config, snake, goal, physics_steps: 0, low_steps: 0, distance: 0.0, success: false };
+        let torques = vec![[0; AXES]; config.robot.modules];
+        let mut plant = SnakePlant {
+            config,
+            snake,
+            goal,
+            physics_steps: 0,
+            low_steps: 0,
+            distance: 0.0,
+            success: false,
+            torques,
+            trace: None,
+        };
         plant.distance = plant.snake.head_distance(plant.goal);
         plant
+    }
+
+    /// The same, keeping the torques of every physics step.
+    pub fn traced(config: Arc<EnvConfig>, seed: u64) -> Self {
+        SnakePlant { trace: Some(Vec::new()), ..SnakePlant::new(config, seed) }
+    }
+
+    /// The torques (yaw and pitch, by their bits) of all physics steps so far, in each module by module; empty if they are not kept.
+    pub fn trace(&self) -> &[[u32; AXES]] {
+        self.trace.as_deref().unwrap_or_default()
     }
 
     /// The snake.
@@ -84,10 +108,14 @@ impl Plant for SnakePlant {
     }
 
     fn set_torque(&mut self, module: usize, torque: [f32; AXES]) {
+        self.torques[module] = torque.map(f32::to_bits);
         self.snake.set_torque(module, torque);
     }
 
     fn step(&mut self) {
+        if let Some(trace) = &mut self.trace {
+            trace.extend_from_slice(&self.torques);
+        }
         self.snake.step();
         self.physics_steps += 1;
         if self.physics_steps.is_multiple_of(self.config.substeps()) {

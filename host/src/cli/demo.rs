@@ -61,7 +61,8 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         };
         let bus = BusOptions::default();
         let record = if label.starts_with("one") { REPLAYED } else { 0 };
-        let trial = BusTrial { config: config.clone(), image, common: &common, bus: &bus, record };
+        let trial =
+            BusTrial { config: config.clone(), image, common: &common, bus: &bus, record, qemu: None, parity: false };
         let bar = common.bar();
         let (report, recorded) = trial.run(None, &|| bar.inc(1))?;
         bar.finish_and_clear();
