@@ -40,7 +40,7 @@ use crate::controller::{BusStatus, Config, FaultSet, Micros, Stats};
 pub const PROTOCOL: u16 = 1;
 
 /// Most bytes of an encoded message, framing and the 0 at its end included.
-pub const MESSAGE_MAX: usize = 256;
+pub const MESSAGE_MAX: usize = 320;
 
 /// Most bytes of a text in a message.
 pub const TEXT_MAX: usize = 200;

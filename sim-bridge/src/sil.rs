@@ -936,7 +936,7 @@ impl<'c, L: Launcher> Engine<'c, L> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use crate::candump;
     use crate::faults::FaultPlan;
@@ -946,16 +946,16 @@ mod tests {
     const MS: u64 = 1_000_000;
 
     /// Joints whose speed follows the torque; whatever was applied is kept.
-    struct Toy {
+    pub(crate) struct Toy {
         modules: usize,
         steps: usize,
         angles: Vec<[f32; 4]>,
         torques: Vec<[f32; 2]>,
-        history: Vec<Vec<[f32; 2]>>,
+        pub(crate) history: Vec<Vec<[f32; 2]>>,
     }
 
     impl Toy {
-        fn new(modules: usize, cycles: usize) -> Self {
+        pub(crate) fn new(modules: usize, cycles: usize) -> Self {
             let angles = (0..modules).map(|m| [0.1 * m as f32, -0.05, 0.02 * m as f32, 0.1]).collect();
             Toy { modules, steps: 5 * cycles, angles, torques: vec![[0.0; 2]; modules], history: Vec::new() }
         }
@@ -1005,7 +1005,7 @@ mod tests {
         }
     }
 
-    fn image() -> [u8; IMAGE_SIZE] {
+    pub(crate) fn image() -> [u8; IMAGE_SIZE] {
         let mut image = [0; IMAGE_SIZE];
         random_image(1, &mut image);
         image
