@@ -53,6 +53,8 @@ fn send(message: &FromModule<'_>) {
 
 /// Says why on the link and ends the emulator with status 1.
 fn die(words: &Text) -> ! {
+    // Perhaps it never came to be enabled.
+    uart::enable();
     // Ends a message that was on its way.
     uart::write(0);
     send(&FromModule::LastWords(words.as_str()));
@@ -127,9 +129,7 @@ mod uart {
             cortex_m::interrupt::disable();
             // SAFETY: the only instance; the macro of the runtime has taken none.
             let mut core = unsafe { cortex_m::Peripherals::steal() };
-            // The slowest divisor is 16; QEMU wants one that is allowed and passes bytes on at once.
-            set(BAUDDIV, 16);
-            set(CTRL, CTRL_TX_ENABLE | CTRL_RX_ENABLE | CTRL_RX_INTERRUPT);
+            enable();
             // SAFETY: no handler runs, see above.
             unsafe { cortex_m::peripheral::NVIC::unmask(Received) };
             core.SYST.set_clock_source(SystClkSource::Core);
@@ -169,6 +169,13 @@ mod uart {
                 }
             }
         }
+    }
+
+    /// Switches the UART on.
+    pub fn enable() {
+        // The smallest divisor that is allowed. QEMU passes bytes on at once anyway.
+        set(BAUDDIV, 16);
+        set(CTRL, CTRL_TX_ENABLE | CTRL_RX_ENABLE | CTRL_RX_INTERRUPT);
     }
 
     /// Sends a byte.

@@ -257,7 +257,7 @@ impl BusTrial<'_> {
             }
             None => self.simulate(&local, policy, &sil, capture, (index < self.record).then_some(&name), &mut recorder),
         }
-        .with_context(|| name.clone())?;
+        .map_err(|error| if self.qemu.is_some() { error.context(name.clone()) } else { error })?;
         let wall = start.elapsed().as_secs_f64();
         for lost in &ours.report.lost {
             eprintln!(

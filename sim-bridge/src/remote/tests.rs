@@ -174,6 +174,13 @@ fn a_link_that_fails_says_how() {
     let policy = Policy::parse(&image).unwrap();
     let good = || hello(Some(&policy));
     let answer = FromModule::Answer { torque: None, motors_enabled: true, deadline: 7, acted: 0 };
+    let boot = |build| {
+        let hello = FromModule::Hello { protocol: PROTOCOL, firmware: 1, build, policy: Some(9) };
+        let bytes = link::encode(&hello, &mut [0; MESSAGE_MAX]).to_vec();
+        Remote::new(Script(bytes), Config::new(0, 1, BusKind::Fd, &policy), 0).hello().unwrap()
+    };
+    assert_eq!(boot(BUILD), Hello { firmware: 1, same_controller: true, policy: 9 });
+    assert!(!boot(BUILD ^ 1).same_controller);
     let frame = || FromModule::Frame(Carried(Frame::new(1, true, &[]).unwrap()));
     assert!(poll(&[good(), answer.clone()], &[]).contains("deadline: 7"));
     let old = FromModule::Hello { protocol: PROTOCOL + 1, firmware: 1, build: 1, policy: Some(1) };
