@@ -143,20 +143,6 @@ pub enum NodePageError {
     },
 }
 
-impl NodePageError {
-    /// What is wrong, in a few words without numbers, for a log that cannot format.
-    pub const fn name(self) -> &'static str {
-        match self {
-            NodePageError::Empty => "empty",
-            NodePageError::TooShort { .. } => "cut short",
-            NodePageError::Magic => "something else lies there",
-            NodePageError::Version { .. } => "another layout version",
-            NodePageError::Checksum { .. } => "damaged",
-            NodePageError::Value { field, .. } => field,
-        }
-    }
-}
-
 impl fmt::Display for NodePageError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match *self {

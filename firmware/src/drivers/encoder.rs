@@ -21,7 +21,7 @@
 //! | DIAAGC | 0x3ffc | bits 0 to 7 gain, 8 ready (LF), 9 CORDIC overflow (COF), 10 magnet too strong (MAGH), 11 too weak (MAGL) |
 //! | ANGLECOM | 0x3fff | angle with dynamic error compensation, 16384 a turn |
 
-use core::f32::consts::{PI, TAU};
+use core::f32::consts::TAU;
 
 use embedded_hal::delay::DelayNs;
 use embedded_hal::spi::{Error as _, ErrorKind, Operation, SpiDevice};
@@ -160,7 +160,7 @@ const fn command(register: u16) -> u16 {
 }
 
 /// How an encoder sits in its joint.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct JointCalibration {
     /// What the encoder reads when the joint is straight, 0 to [`STEPS`] - 1.
     pub zero: u16,
@@ -223,6 +223,7 @@ fn wrap(angle: f32) -> f32 {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
+    use core::f32::consts::PI;
     use embedded_hal_mock::eh1::delay::NoopDelay;
     use embedded_hal_mock::eh1::spi::{Mock, Transaction};
     use std::vec;

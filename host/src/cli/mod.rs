@@ -5,6 +5,7 @@ mod dbc;
 mod demo;
 mod eval;
 mod export;
+mod flash;
 mod policy_file;
 mod report;
 mod sil;
@@ -41,6 +42,8 @@ enum Verb {
     Report(report::Arguments),
     /// Measure the speed of physics, training and bus on this machine.
     Bench(bench::Arguments),
+    /// Make a module of a board: image, policy and node page by a debug probe.
+    Flash(flash::Arguments),
     /// Print the bus's message database in DBC form.
     Dbc(dbc::Arguments),
 }
@@ -62,6 +65,7 @@ pub fn main() -> ExitCode {
         Some(Verb::Sil(arguments)) => sil::run(&arguments),
         Some(Verb::Report(arguments)) => report::run(&arguments),
         Some(Verb::Bench(arguments)) => bench::run(&arguments),
+        Some(Verb::Flash(arguments)) => flash::run(&arguments),
         Some(Verb::Dbc(arguments)) => dbc::run(&arguments),
         None => demo::run(&arguments.demonstration),
     };
