@@ -147,7 +147,8 @@ fn a_dry_run_prints_the_commands_and_keeps_the_files() {
     let printed = String::from_utf8(output.stdout).unwrap();
     let path = format!("{}:/usr/bin:/bin", bench.path().join("tools").display());
     // What it prints can be run as it stands, with the same effect.
-    let shell = std::process::Command::new("sh").current_dir(bench.path()).env("PATH", path).args(["-ec", &printed]).output();
+    let shell =
+        std::process::Command::new("sh").current_dir(bench.path()).env("PATH", path).args(["-ec", &printed]).output();
     assert!(shell.unwrap().status.success());
     assert_eq!(bench.calls().len(), 4);
     assert_eq!(bench.read("tools/node-page.bin.written"), bench.read("my module/node-page.bin"));

@@ -83,7 +83,9 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         find_probe()?;
     }
     if arguments.calibration.is_none() {
-        eprintln!("snakectl: without --calibration the module gets nominal values, and encoders that were never zeroed");
+        eprintln!(
+            "snakectl: without --calibration the module gets nominal values, and encoders that were never zeroed"
+        );
     }
     if arguments.dry_run {
         for (_, step) in plan.steps() {

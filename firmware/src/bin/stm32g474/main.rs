@@ -41,8 +41,10 @@ mod sense;
 
 use core::cell::RefCell;
 
-use composer_firmware::controller::{BusKind, Config, Controller, FIRMWARE_VERSION};
+use composer_firmware::controller::{BusKind, Config, ConfigError, Controller, FIRMWARE_VERSION};
+use composer_firmware::node_page::NodePage;
 use composer_shared::observation::Sensors;
+use composer_shared::policy::Policy;
 use composer_shared::robot::AXES;
 use composer_shared::wire::{Fault, Health, Heartbeat, Message, Mode, NOBODY, PROTOCOL_VERSION};
 use defmt::Display2Format;
@@ -57,6 +59,7 @@ use embassy_stm32::spi::{MODE_1, MODE_3, Spi};
 use embassy_stm32::time::Hertz;
 use embassy_stm32::wdg::IndependentWatchdog;
 use embassy_time::{Duration, Instant, Timer, with_deadline};
+use static_cell::StaticCell;
 
 use can::CanPort;
 use sense::Sense;
@@ -130,11 +133,10 @@ async fn main(_spawner: Spawner) -> ! {
         }
     };
     defmt::info!("policy {=u32:08x} for {=str}", policy.crc(), policy.task().name());
-    let settings = Config { bus_off: page.bus_off, ..Config::new(page.node, page.modules, BusKind::Fd, &policy) };
-    let mut controller = match Controller::new(settings, policy, now()) {
+    let controller = match make_controller(&page, policy) {
         Ok(controller) => controller,
         Err(error) => {
-            defmt::error!("{}", Display2Format(&error));
+            defmt::error!("{}", Display2Format(error));
             refuse(2, Some((&mut can, page.node)), &mut light, &mut watchdog).await
         }
     };
@@ -157,7 +159,19 @@ async fn main(_spawner: Spawner) -> ! {
         &page,
         policy.geometry(),
     );
-    run(&mut controller, policy.limits().torque, &mut can, &mut sense, &mut watchdog).await
+    run(controller, policy.limits().torque, &mut can, &mut sense, &mut watchdog).await
+}
+
+/// Makes the controller where it stays. Apart, and not inlined, because it is large: a copy of it in the frame of the main loop would take
+/// stack for ever.
+#[inline(never)]
+fn make_controller(
+    page: &NodePage,
+    policy: Policy<'static>,
+) -> Result<&'static mut Controller<'static>, &'static mut ConfigError> {
+    static CONTROLLER: StaticCell<Result<Controller<'static>, ConfigError>> = StaticCell::new();
+    let settings = Config { bus_off: page.bus_off, ..Config::new(page.node, page.modules, BusKind::Fd, &policy) };
+    CONTROLLER.init_with(|| Controller::new(settings, policy, now())).as_mut()
 }
 
 /// The main loop.
