@@ -131,7 +131,7 @@ impl<S: SpiDevice, D: DelayNs> As5047p<S, D> {
         if answer == u16::MAX {
             return Err(EncoderError::NoAnswer);
         }
-        if answer.count_ones() % 2 != 0 {
+        if !answer.count_ones().is_multiple_of(2) {
             return Err(EncoderError::Parity);
         }
         if answer & ERROR_FLAG != 0 {
@@ -156,7 +156,7 @@ impl<S: SpiDevice, D: DelayNs> As5047p<S, D> {
 /// The frame that reads `register`.
 const fn command(register: u16) -> u16 {
     let word = register | READ;
-    if word.count_ones() % 2 == 0 { word } else { word | PARITY }
+    if word.count_ones().is_multiple_of(2) { word } else { word | PARITY }
 }
 
 /// How an encoder sits in its joint.
