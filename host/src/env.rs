@@ -505,7 +505,7 @@ mod tests {
     #[test]
     fn an_episode_is_cut_at_the_cap_and_ends_at_the_goal() {
         let mut config = EnvConfig::new(Task::GoalReaching, Robot::default());
-        config.task.cap = 3;
+        config.task.settings.cap = 3;
         let mut env = SnakeEnv::new(Arc::new(config));
         let still = [[0.0; 2]; 8];
         assert!(!env.step(&still).truncated && !env.step(&still).truncated);
