@@ -16,12 +16,13 @@ use composer_sim_bridge::faults::{Fault, FaultKind, ScheduledFault};
 use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use rapier3d::math::{Rotation, Vector};
 use serde::{Deserialize, Serialize};
 
 use crate::environment::{Environment, Outcome, PRIVILEGED, View};
 use crate::robot::Robot;
 use crate::sim::{Motion, Snake};
-use crate::tasks::{Judge, Point, TaskConfig, Verdict};
+use crate::tasks::{Judge, Point, Reward, TaskConfig, Verdict};
 
 /// Faults that training draws for each episode.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -357,6 +358,25 @@ impl Environment for SnakeEnv {
             episode_return: self.episode_return,
         }
     }
+
+    fn place(&self, module: usize, offset: [f32; 3]) -> Point {
+        let rotation = Rotation::from_array(self.snake.module_rotation(module));
+        (Vector::from(self.snake.module_position(module)) + rotation * Vector::from(offset)).to_array()
+    }
+
+    /// Of the kind that the task pays: the decrease of the task's distance ([`crate::tasks::Rules::imagined_distance`]) from the modules' places now to
+    /// those imagined, or -0.1 times the latter.
+    fn imagined_reward(&self, positions: &[Point]) -> f32 {
+        let task = &self.config.task;
+        let distance = |p: &[Point]| task.rules().imagined_distance(self.judge.course(), &self.snake, p);
+        match task.settings.reward {
+            Reward::Paper => -0.1 * distance(positions),
+            Reward::Progress => {
+                let here: Vec<_> = (0..self.modules()).map(|module| self.snake.module_position(module)).collect();
+                distance(&here) - distance(positions)
+            }
+        }
+    }
 }
 
 #[cfg(test)]
@@ -444,6 +464,48 @@ mod tests {
         env.view(&mut view);
         assert_eq!(view.observations[0][7], 1.0);
         assert!(view.observations[1..].iter().all(|o| o[..8].iter().all(|v| *v == 0.0)));
+    }
+
+    #[test]
+    fn what_is_imagined_lies_where_the_modules_frame_says_and_earns_what_the_task_says() {
+        for (reward, task) in [Task::GoalReaching, Task::ShapeFormation]
+            .into_iter()
+            .flat_map(|task| [(Reward::Progress, task), (Reward::Paper, task)])
+        {
+            let mut config = EnvConfig::new(task, Robot::default());
+            config.task.settings.reward = reward;
+            let mut env = SnakeEnv::new(Arc::new(config));
+            // Bent and turned: the frames differ from the world's.
+            drive(&mut env, 20);
+            let (task, goal) = (&env.config.task, env.judge.course().goal);
+            let left = |p: &[Point]| task.rules().imagined_distance(env.judge.course(), &env.snake, p);
+            let offset = [0.3, -0.2, 0.1];
+            let here: Vec<_> = (0..8).map(|module| env.place(module, [0.0; 3])).collect();
+            for (module, place) in here.iter().enumerate() {
+                assert_eq!(*place, env.snake.module_position(module));
+                let back = env.snake.in_own_frame(module, env.place(module, offset));
+                assert!(back.iter().zip(offset).all(|(b, o)| (b - o).abs() < 1e-5), "{back:?}");
+            }
+            // Half a unit towards the middle of the course.
+            let there: Vec<Point> = here
+                .iter()
+                .map(|p| {
+                    let way: Point = std::array::from_fn(|axis| goal[axis] - p[axis]);
+                    let length = way.iter().map(|x| x * x).sum::<f32>().sqrt();
+                    std::array::from_fn(|axis| p[axis] + 0.5 * way[axis] / length)
+                })
+                .collect();
+            match reward {
+                Reward::Progress => {
+                    assert_eq!(env.imagined_reward(&here), 0.0);
+                    assert!((env.imagined_reward(&there) - (left(&here) - left(&there))).abs() < 1e-6);
+                }
+                Reward::Paper => assert!((env.imagined_reward(&there) + 0.1 * left(&there)).abs() < 1e-6),
+            }
+            if task.task() == Task::GoalReaching {
+                assert!((left(&here) - left(&there) - 0.5).abs() < 1e-3);
+            }
+        }
     }
 
     #[test]

@@ -1,8 +1,10 @@
-//! What a learner sees of a robot made of modules, and a trivial such robot to test learners with.
+//! What a learner sees of a robot made of modules, and two trivial such robots to test learners with.
 
 use composer_shared::observation::{Observation, SIZE};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+
+use crate::tasks::Point;
 
 /// Extra numbers per module that only the critic sees, and only in training (linear velocity, height, fault flags ...).
 pub const PRIVILEGED: usize = 16;
@@ -67,6 +69,11 @@ pub trait Environment: Send {
     fn view(&self, view: &mut View);
     /// Applies one action per module (unclipped; the environment clips) for one control step.
     fn step(&mut self, actions: &[[f32; 2]]) -> Outcome;
+    /// The point of the world that lies at `offset` from a module, in the module's own frame; units. All zeros give the module's place.
+    fn place(&self, module: usize, offset: [f32; 3]) -> Point;
+    /// What the imagination policy earns for imagining the modules at `positions` (world, units) one step from now: the more, the nearer
+    /// they would be to the state that completes the task (paper, section III-B, `R^H`).
+    fn imagined_reward(&self, positions: &[Point]) -> f32;
 }
 
 /// Who is told the target of a [`Trivial`] environment.
@@ -83,6 +90,8 @@ pub enum Told {
 ///
 /// The reward of a step is `1 - mean squared error` over the modules that act, at most 1. An episode has [`Trivial::STEPS`] steps and
 /// ends by truncation. With [`Told::Head`] a team of n that cannot talk earns at most 1 - (n - 1) / 3n on average, by the head alone.
+///
+/// The modules stay at the origin, whatever they do; they are imagined best at the target as a point of the plane.
 #[derive(Clone, Debug)]
 pub struct Trivial {
     modules: usize,
@@ -163,4 +172,107 @@ impl Environment for Trivial {
             episode_return: self.episode_return,
         }
     }
+
+    fn place(&self, _module: usize, offset: [f32; 3]) -> Point {
+        offset
+    }
+
+    fn imagined_reward(&self, positions: &[Point]) -> f32 {
+        let [x, y] = self.target;
+        -mean_distance(positions.iter().map(|p| (*p, [x, y, 0.0])))
+    }
+}
+
+/// The simplest body that can follow an imagination: points in a plane, each turned its own way, that move as told, and a target for each.
+///
+/// The task pays nothing. Whoever learns to move the points to their targets has learnt it from the imagination policy, which is paid for
+/// imagining them nearer. Module i observes its target in its own frame in the first two fields; its action is its velocity in its own
+/// frame, as a fraction of [`Drift::SPEED`]. An episode has [`Drift::STEPS`] steps and ends by truncation.
+#[derive(Clone, Debug)]
+pub struct Drift {
+    positions: Vec<Point>,
+    headings: Vec<f32>,
+    targets: Vec<Point>,
+    steps: u32,
+}
+
+impl Drift {
+    /// Steps in an episode.
+    pub const STEPS: u32 = 16;
+    /// Farthest that a point moves along an axis in a step, units.
+    pub const SPEED: f32 = 0.5;
+    /// Targets lie within this of the points at the start along each axis, units.
+    const RANGE: f32 = 3.0;
+
+    /// So many points.
+    pub fn new(modules: usize) -> Self {
+        let (positions, headings, targets) = (vec![[0.0; 3]; modules], vec![0.0; modules], vec![[0.0; 3]; modules]);
+        let mut drift = Self { positions, headings, targets, steps: 0 };
+        drift.reset(0);
+        drift
+    }
+
+    /// Mean distance of the points from their targets, units.
+    fn distance(&self, positions: &[Point]) -> f32 {
+        mean_distance(positions.iter().copied().zip(self.targets.iter().copied()))
+    }
+}
+
+impl Environment for Drift {
+    fn modules(&self) -> usize {
+        self.positions.len()
+    }
+
+    fn reset(&mut self, seed: u64) {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        self.steps = 0;
+        let mut number = |range: f32| rng.random_range(-range..range);
+        for module in 0..self.positions.len() {
+            self.headings[module] = number(std::f32::consts::PI);
+            self.positions[module] = [number(Self::RANGE), number(Self::RANGE), 0.0];
+            let [x, y, z] = self.positions[module];
+            self.targets[module] = [x + number(Self::RANGE), y + number(Self::RANGE), z];
+        }
+    }
+
+    fn view(&self, view: &mut View) {
+        view.clear(self.positions.len());
+        for (module, observation) in view.observations.iter_mut().enumerate() {
+            let (sin, cos) = libm::sincosf(self.headings[module]);
+            let [x, y] = [0, 1].map(|axis| self.targets[module][axis] - self.positions[module][axis]);
+            observation[..2].copy_from_slice(&[cos * x + sin * y, cos * y - sin * x]);
+            observation[27] = composer_shared::observation::place(module, self.positions.len());
+        }
+    }
+
+    fn step(&mut self, actions: &[[f32; 2]]) -> Outcome {
+        for (module, action) in actions.iter().enumerate() {
+            let [x, y] = action.map(|a| Self::SPEED * a.clamp(-1.0, 1.0));
+            self.positions[module] = self.place(module, [x, y, 0.0]);
+        }
+        self.steps += 1;
+        let distance = self.distance(&self.positions);
+        Outcome {
+            truncated: self.steps >= Self::STEPS,
+            success: distance < Self::SPEED,
+            distance,
+            steps: self.steps,
+            ..Outcome::default()
+        }
+    }
+
+    fn place(&self, module: usize, [x, y, z]: [f32; 3]) -> Point {
+        let (sin, cos) = libm::sincosf(self.headings[module]);
+        let at = self.positions[module];
+        [at[0] + cos * x - sin * y, at[1] + sin * x + cos * y, at[2] + z]
+    }
+
+    fn imagined_reward(&self, positions: &[Point]) -> f32 {
+        self.distance(&self.positions) - self.distance(positions)
+    }
+}
+
+fn mean_distance(pairs: impl ExactSizeIterator<Item = (Point, Point)>) -> f32 {
+    let count = pairs.len().max(1) as f32;
+    pairs.map(|(p, q)| libm::sqrtf((0..3).map(|axis| (p[axis] - q[axis]).powi(2)).sum())).sum::<f32>() / count
 }

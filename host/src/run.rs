@@ -93,42 +93,55 @@ pub struct RunConfig {
 }
 
 impl RunConfig {
-    /// Changes one setting: `section.key=value`, or `key=value` where only one section has such a key. The value is TOML; a bare word
-    /// is a string.
+    /// Changes one setting: `section.key=value`, or `key=value` where only one section, or that of the task, has such a key; a setting
+    /// of a section within a section is `inner.key=value`. The value is TOML; a bare word is a string.
     pub fn set(&mut self, assignment: &str) -> Result<()> {
         let Some((key, value)) = assignment.split_once('=') else {
             bail!("`{assignment}` is no setting: write key=value, such as train.learning_rate=3e-4");
         };
         let (key, value) = (key.trim(), value.trim());
         let mut document = toml::Table::try_from(&*self).context("the settings cannot be written as TOML")?;
-        let mut places: Vec<(String, String)> = Vec::new();
-        for (section, table) in &document {
-            for name in table.as_table().into_iter().flatten().map(|(name, _)| name) {
+        let tables = |table: &toml::Table| -> Vec<(String, toml::Table)> {
+            table.iter().filter_map(|(name, value)| Some((name.clone(), value.as_table()?.clone()))).collect()
+        };
+        let mut places: Vec<Vec<String>> = Vec::new();
+        for (section, table) in tables(&document) {
+            for name in table.keys().filter(|name| !table[*name].is_table()) {
                 if key == name || key == format!("{section}.{name}") {
-                    places.push((section.clone(), name.clone()));
+                    places.push(vec![section.clone(), name.clone()]);
+                }
+            }
+            for (inner, table) in tables(&table) {
+                for name in table.keys() {
+                    if key == format!("{inner}.{name}") || key == format!("{section}.{inner}.{name}") {
+                        places.push(vec![section.clone(), inner.clone(), name.clone()]);
+                    }
                 }
             }
         }
-        let (section, name) = match &places[..] {
-            [(section, name)] => (section.clone(), name.clone()),
+        let of_task = self.task.name.name().replace('-', "_");
+        if places.len() > 1 && places.iter().any(|place| place[0] == of_task) {
+            places.retain(|place| place[0] == of_task);
+        }
+        let place = match &places[..] {
+            [place] => place,
             [] => bail!("there is no setting `{key}`; config.toml in any run folder lists them all"),
             several => bail!(
                 "`{key}` could be {}; say which",
-                several.iter().map(|(s, n)| format!("{s}.{n}")).collect::<Vec<_>>().join(" or ")
+                several.iter().map(|place| place.join(".")).collect::<Vec<_>>().join(" or ")
             ),
         };
-        let old = &document[&section][&name];
         let mut new = match toml::from_str::<toml::Table>(&format!("x = {value}")) {
             Ok(mut parsed) => parsed.remove("x").unwrap_or_else(|| toml::Value::String(value.into())),
             Err(_) => toml::Value::String(value.into()),
         };
+        let (first, rest) = (&place[0], &place[1..]);
+        let old = rest.iter().fold(&mut document[first], |table, name| &mut table[name]);
         // 1 is as good as 1.0 where a number with a point belongs.
-        if let (toml::Value::Float(_), toml::Value::Integer(i)) = (old, &new) {
+        if let (toml::Value::Float(_), toml::Value::Integer(i)) = (&*old, &new) {
             new = toml::Value::Float(*i as f64);
         }
-        if let Some(table) = document[&section].as_table_mut() {
-            table.insert(name, new);
-        }
+        *old = new;
         *self = document
             .try_into()
             .map_err(|error| anyhow::anyhow!("{key}={value} is not possible: {}", error.message()))?;
@@ -229,6 +242,20 @@ mod tests {
         config.set("goal_known_to=head").unwrap();
         assert_eq!((config.train.learning_rate, config.goal_reaching.goal_distance), (1.0, [4.0, 15.0]));
         assert_eq!(config.env.goal_known_to, Knows::Head);
+        // The section of the task comes first.
+        config.set("name=block-pushing").unwrap();
+        config.set("goal_distance=[5, 6]").unwrap();
+        assert_eq!(config.block_pushing.goal_distance, [5.0, 6.0]);
+        assert!(config.set("name=dancing").unwrap_err().to_string().contains("no task `dancing`"));
+        config.set("task.name=shape-formation").unwrap();
+        assert!(config.set("goal_bearing=5").unwrap_err().to_string().contains("say which"));
+        config.set("imagination.follow=1").unwrap();
+        config.set("train.imagination.bound=0.25").unwrap();
+        config.set("sigma=0.3").unwrap();
+        let imagination = &config.train.imagination;
+        assert_eq!((imagination.follow, imagination.bound, config.train.sigma), (1.0, 0.25, 0.3));
+        assert!(config.set("imagination=1").unwrap_err().to_string().contains("no setting"));
+        assert!(config.set("imagination.folow=1").unwrap_err().to_string().contains("no setting"));
         assert!(config.set("nonsense=1").unwrap_err().to_string().contains("no setting `nonsense`"));
         assert!(config.set("cap=-1").unwrap_err().to_string().contains("cap=-1 is not possible"));
         assert!(config.set("cap").unwrap_err().to_string().contains("key=value"));

@@ -63,7 +63,8 @@ fn a_policy_of_another_task_is_refused() {
     mend(&mut image);
     std::fs::write(folder.path().join("tube.policy"), image).unwrap();
     for verb in ["eval", "sil"] {
-        refuse(folder.path(), &[verb, "tube.policy"], &["tube-crossing", "goal-reaching"]);
+        let wanted = [verb, "tube.policy", "--task", "goal-reaching"];
+        refuse(folder.path(), &wanted, &["trained for tube-crossing", "cannot do goal-reaching"]);
     }
 }
 
@@ -110,7 +111,20 @@ fn settings_flags_and_faults_are_checked() {
     refuse(folder.path(), &train(&["--set", "gama=0.9"]), &["gama"]);
     refuse(folder.path(), &train(&["--set", "gamma=1.5"]), &["gamma", "1.5"]);
     refuse(folder.path(), &train(&["--set", "goal_distance=[1, 5]"]), &["goal_distance"]);
-    refuse(folder.path(), &["train", "swimming"], &["swimming"]);
+    refuse(folder.path(), &["train", "swimming"], &["swimming", "wall-climbing"]);
+    // Scenes that cannot be.
+    for (task, setting, words) in [
+        ("tube-crossing", "tube_width=0.7", ["tube_width = 0.7", "0.8 units thick"]),
+        ("tube-crossing", "goal_beyond=0.5", ["goal_beyond = 0.5", "inside the tube"]),
+        ("wall-climbing", "wall_thickness=0", ["wall_thickness = 0", "from 0.5"]),
+        ("wall-climbing", "wall_height=[0.5, 1]", ["wall_height = [0.5, 1]", "higher than the snake"]),
+        ("block-pushing", "block_distance=[0, 3]", ["block_distance = [0, 3]", "stand on the snake"]),
+        ("block-pushing", "goal_distance=[0.5, 3]", ["goal_distance = [0.5, 3]", "from the start"]),
+        ("goal-reaching", "goal_distance=[10, 1000]", ["goal_distance = [10, 1000]", "within 100 units"]),
+        ("shape-formation", "shapes=[]", ["shapes = []", "at least one"]),
+    ] {
+        refuse(folder.path(), &["train", task, "--steps", "100", "--set", setting], &words);
+    }
     refuse(folder.path(), &["eval", "goal-reaching", "--fault", "explode:1"], &["explode"]);
     refuse(folder.path(), &["eval", "goal-reaching", "--fault", "unplug:9"], &["9", "8"]);
     refuse(folder.path(), &["eval", "goal-reaching", "--fault", "drop:0.1"], &["sil"]);

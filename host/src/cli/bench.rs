@@ -11,11 +11,12 @@ use super::PolicySource;
 use crate::env::{EnvConfig, SnakeEnv};
 use crate::environment::{Environment, View};
 use crate::eval::{Pilot, episode_seed, parallel};
+use crate::methods::Method;
 use crate::robot::Robot;
 use crate::run::RunConfig;
 use crate::sil::SnakePlant;
-use crate::train::Trainer;
 use crate::train::progress::Times;
+use crate::train::{TrainConfig, Trainer};
 
 /// Lengths at which cost is measured.
 const LENGTHS: [usize; 4] = [8, 16, 32, 64];
@@ -112,17 +113,18 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     for (task, rate) in &rates {
         println!("{:>16} {rate:>16.0} {:>14.2}", task.name(), rate / rates[0].1);
     }
-    let config = RunConfig::default();
-    let times = training(&config, 3.0 * seconds)?;
-    let [physics, inference, update] = times.shares();
-    println!(
-        "\ntraining, 8 modules, {} threads: {:.0} environment steps/s; physics {:.0} %, inference {:.0} %, update {:.0} % of the time",
-        cores,
-        times.steps_per_second(),
-        100.0 * physics,
-        100.0 * inference,
-        100.0 * update
-    );
+    println!("\ntraining, {} modules, {cores} threads", robot.modules);
+    println!("{:>24} {:>20} {:>9} {:>10} {:>7}", "method", "environment steps/s", "physics", "inference", "update");
+    for method in [Method::Composer, Method::ComposerNoImagination] {
+        let train = TrainConfig { method, ..TrainConfig::default() };
+        let times = training(&RunConfig { train, ..RunConfig::default() }, 3.0 * seconds)?;
+        let [physics, inference, update] = times.shares().map(|share| 100.0 * share);
+        println!(
+            "{:>24} {:>20.0} {physics:>7.0} % {inference:>8.0} % {update:>5.0} %",
+            method.name(),
+            times.steps_per_second()
+        );
+    }
     if let Ok(PolicySource::Image(image)) = PolicySource::load("goal-reaching") {
         println!("\ncontrollers on the CAN-FD bus (1M/5M) with physics, one thread");
         println!("{:>8} {:>16} {:>10}", "modules", "times real time", "bus load");

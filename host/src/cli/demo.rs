@@ -1,14 +1,19 @@
-//! `snakectl` without a verb: the whole on the simulated bus, with a module unplugged on the way.
+//! `snakectl` without a verb: every policy that ships, on the simulated bus, with a module unplugged on the way. `snakectl demo TASK`: one of
+//! them in more detail.
 
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
+use composer_shared::policies;
+use composer_shared::policy::Task;
 use composer_sim_bridge::faults::FaultPlan;
 
-use super::PolicySource;
 use super::eval::Common;
 use super::sil::{BusOptions, BusReport, BusTrial, REPLAYED, write_replay};
+use super::{PolicySource, task_by_name};
+use crate::env::EnvConfig;
+use crate::replay::Episode;
 
 /// Arguments of the demonstration.
 #[derive(clap::Args, Clone, Debug)]
@@ -24,33 +29,46 @@ pub struct Arguments {
     replay: PathBuf,
 }
 
-/// Runs the demonstration.
-pub fn run(arguments: &Arguments) -> Result<()> {
-    let name = "goal-reaching";
-    let source = PolicySource::load(name)?;
-    let PolicySource::Image(image) = &source else { anyhow::bail!("{name} ships as an image") };
-    let config = Arc::new(source.environment(None, None)?);
-    println!(
-        "{} modules, each running the frozen {name} policy ({} bytes) in its own controller, on a simulated CAN-FD bus (1M/5M).\n",
-        config.robot.modules,
-        image.len()
-    );
-    println!(
-        "{:<28} {:>14} {:>14} {:>16} {:>9} {:>10}",
-        "", "success", "distance/units", "control steps", "bus load", "real time"
-    );
-    let rows = [
-        ("all modules", "none"),
-        ("one unplugged on the way", "unplug:1"),
-        ("two unplugged on the way", "unplug:2"),
-        ("the head unplugged at 1 s", "unplug:#0@1s"),
-        ("5 % of frames lost", "drop:0.05"),
-    ];
-    let mut to_replay = Vec::new();
-    for (label, fault) in rows {
+/// Arguments of `demo`.
+#[derive(clap::Args, Clone, Debug)]
+pub struct OneTask {
+    /// goal-reaching, block-pushing, shape-formation, tube-crossing or wall-climbing
+    #[arg(value_parser = task_by_name)]
+    task: Task,
+    #[command(flatten)]
+    arguments: Arguments,
+}
+
+/// What goes wrong in the rows of the table for one task.
+const FAULTS: [(&str, &str); 5] = [
+    ("all modules", "none"),
+    ("one unplugged on the way", "unplug:1"),
+    ("two unplugged on the way", "unplug:2"),
+    ("the head unplugged at 1 s", "unplug:#0@1s"),
+    ("5 % of frames lost", "drop:0.05"),
+];
+
+/// A shipped policy and the environment it is made for.
+struct Shipped {
+    name: &'static str,
+    image: &'static [u8],
+    config: Arc<EnvConfig>,
+}
+
+impl Shipped {
+    fn new(name: &'static str) -> Result<Self> {
+        let Some(image) = policies::shipped(name) else {
+            bail!("no policy for {name} ships with this version; these do: {}", policies::NAMES.join(", "));
+        };
+        let config = Arc::new(PolicySource::load(name)?.environment(None, None)?);
+        Ok(Shipped { name, image, config })
+    }
+
+    /// Runs the episodes of a row; the first `record` of them are recorded.
+    fn run(&self, arguments: &Arguments, fault: &str, record: usize) -> Result<(BusReport, Vec<Episode>)> {
         let fault: FaultPlan = fault.parse().with_context(|| format!("the fault {fault}"))?;
         let common = Common {
-            policy: name.into(),
+            policy: self.name.into(),
             task: None,
             episodes: arguments.episodes,
             modules: None,
@@ -61,27 +79,76 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             threads: None,
         };
         let bus = BusOptions::default();
-        let record = if label.starts_with("one") { REPLAYED } else { 0 };
-        let trial = BusTrial { config: config.clone(), image, common: &common, bus: &bus, record };
+        let trial = BusTrial { config: self.config.clone(), image: self.image, common: &common, bus: &bus, record };
         let bar = common.bar();
-        let (report, recorded) = trial.run(None, &|| bar.inc(1))?;
+        let result = trial.run(None, &|| bar.inc(1));
         bar.finish_and_clear();
+        result
+    }
+}
+
+/// Runs the demonstration of all tasks.
+pub fn run(arguments: &Arguments) -> Result<()> {
+    let shipped = policies::NAMES.into_iter().map(Shipped::new).collect::<Result<Vec<_>>>()?;
+    let Some(first) = shipped.first() else { bail!("no policy ships with this version") };
+    println!(
+        "{} modules, each running the frozen policy of the task in its own controller, on a simulated CAN-FD bus (1M/5M).\n",
+        first.config.robot.modules
+    );
+    header();
+    let mut to_replay = Vec::new();
+    for policy in &shipped {
+        for (label, fault) in &FAULTS[..2] {
+            let (report, recorded) = policy.run(arguments, fault, usize::from(*fault != "none"))?;
+            println!("{}", row(&format!("{}, {label}", policy.name), &report));
+            to_replay.extend(recorded);
+        }
+    }
+    write_replay(&first.config, to_replay, "all that ship", &arguments.replay)?;
+    footer(arguments, "an episode of every task with a module unplugged");
+    Ok(())
+}
+
+/// Runs the demonstration of one task.
+pub fn run_one(one: &OneTask) -> Result<()> {
+    let (policy, arguments) = (Shipped::new(one.task.name())?, &one.arguments);
+    println!(
+        "{} modules, each running the frozen {} policy ({} bytes) in its own controller, on a simulated CAN-FD bus (1M/5M).\n",
+        policy.config.robot.modules,
+        policy.name,
+        policy.image.len()
+    );
+    header();
+    let mut to_replay = Vec::new();
+    for (label, fault) in FAULTS {
+        let (report, recorded) = policy.run(arguments, fault, if fault == "unplug:1" { REPLAYED } else { 0 })?;
         println!("{}", row(label, &report));
         to_replay.extend(recorded);
     }
-    write_replay(&config, to_replay, name, &arguments.replay)?;
+    write_replay(&policy.config, to_replay, policy.name, &arguments.replay)?;
+    footer(arguments, "the first episodes with a module unplugged");
+    Ok(())
+}
+
+fn header() {
     println!(
-        "\n{} episodes a row; mean and standard error. {} shows the first with a module unplugged: open it in any browser.",
+        "{:<42} {:>14} {:>14} {:>16} {:>9} {:>10}",
+        "", "success", "distance/units", "control steps", "bus load", "real time"
+    );
+}
+
+fn footer(arguments: &Arguments, shown: &str) {
+    println!(
+        "\n{} episodes a row; mean and standard error. {} shows {shown}: open it in any browser.",
         arguments.episodes,
         arguments.replay.display()
     );
-    Ok(())
 }
 
 fn row(label: &str, report: &BusReport) -> String {
     let task = &report.task;
     format!(
-        "{label:<28} {:>6.2} +- {:.2} {:>6.2} +- {:.2} {:>7.1} +- {:<4.1} {:>7.1} % {:>8.0} x",
+        "{label:<42} {:>6.2} +- {:.2} {:>6.2} +- {:.2} {:>7.1} +- {:<4.1} {:>7.1} % {:>8.0} x",
         task.success_rate,
         task.success_rate_se,
         task.distance_mean,

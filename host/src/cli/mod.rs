@@ -42,6 +42,8 @@ enum Verb {
     Report(report::Arguments),
     /// Measure the speed of physics, training and bus on this machine.
     Bench(bench::Arguments),
+    /// Show the shipped policy of one task on the simulated bus.
+    Demo(demo::OneTask),
     /// Print the bus's message database in DBC form.
     Dbc(dbc::Arguments),
 }
@@ -64,6 +66,7 @@ pub fn main() -> ExitCode {
         Some(Verb::Report(arguments)) => report::run(&arguments),
         Some(Verb::Bench(arguments)) => bench::run(&arguments),
         Some(Verb::Dbc(arguments)) => dbc::run(&arguments),
+        Some(Verb::Demo(arguments)) => demo::run_one(&arguments),
         None => demo::run(&arguments.demonstration),
     };
     match result {

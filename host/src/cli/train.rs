@@ -28,7 +28,8 @@ pub struct Arguments {
     /// goal-reaching]
     #[arg(value_parser = task_by_name)]
     task: Option<Task>,
-    /// composer-no-imagination (self-attention) or mappo (no attention) [default: composer-no-imagination]
+    /// composer (self-attention and imagination policy), composer-no-imagination, composer-no-attention or mappo (neither)
+    /// [default: the settings file's, else composer]
     #[arg(long)]
     method: Option<Method>,
     /// Seed of the run: same seed, same policy, bit for bit [default: 1]

@@ -1,7 +1,8 @@
 //! The actor and the critic as burn computes their gradients, over flat parameter vectors.
 //!
-//! The actor is the network of [`crate::network`]: encoder, optional attention, hidden layer, two outputs a module, and a standard
-//! deviation that does not depend on the state. The critic sees the whole team: the same two layers for every module, then the mean
+//! The actor of the control policy is the network of [`crate::network`]: encoder, optional attention, hidden layer, two outputs a module,
+//! and a standard deviation that does not depend on the state. That of the imagination policy is the same without attention and with
+//! three outputs. The critic sees the whole team: the same two layers for every module, then the mean
 //! over the modules beside the head module's embedding, so that it works for any number of modules.
 
 use burn::tensor::activation::softmax;
@@ -9,6 +10,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use composer_shared::observation::SIZE;
 
 use super::fused::bias_tanh;
+use super::imagination::DISPLACEMENT;
 use super::{Block, Method, Stream, lay_out, orthogonal, stream};
 use crate::environment::PRIVILEGED;
 use crate::network::{Dense, Network};
@@ -21,7 +23,7 @@ pub const KEY: usize = 16;
 pub const VALUE: usize = 32;
 /// Size of the hidden layer.
 pub const HIDDEN: usize = 64;
-/// Actions of a module: yaw and pitch torque as a fraction of the limit.
+/// Actions of a module under the control policy: yaw and pitch torque as a fraction of the limit.
 pub const OUT: usize = 2;
 /// What the critic knows of a module.
 pub const CRITIC_INPUT: usize = SIZE + PRIVILEGED;
@@ -29,8 +31,8 @@ pub const CRITIC_INPUT: usize = SIZE + PRIVILEGED;
 /// Added to the score of a module that is not heard.
 const UNHEARD: f32 = -1e9;
 
-/// Where things are in the actor's parameters.
-#[derive(Clone, Copy, Debug)]
+/// Where things are in an actor's parameters.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ActorLayout {
     /// `[EMBED, SIZE]` weights of the encoder.
     pub encoder: Block,
@@ -55,9 +57,18 @@ pub struct ActorLayout {
 }
 
 impl ActorLayout {
-    /// The layout for a method.
-    pub fn new(method: Method) -> Self {
-        let attention = usize::from(method.attention());
+    /// The layout of a method's control policy.
+    pub fn control(method: Method) -> Self {
+        Self::new(method.attention(), OUT)
+    }
+
+    /// The layout of the imagination policy, which has no attention: it never leaves the training, where nobody has to talk.
+    pub fn imagination() -> Self {
+        Self::new(false, DISPLACEMENT)
+    }
+
+    fn new(attention: bool, outputs: usize) -> Self {
+        let attention = usize::from(attention);
         let (
             [encoder, encoder_bias, attention, hidden, hidden_context, hidden_bias, output, output_bias, log_sigma],
             len,
@@ -68,9 +79,9 @@ impl ActorLayout {
             ("hidden.weight", HIDDEN, EMBED),
             ("hidden.context_weight", HIDDEN, attention * VALUE),
             ("hidden.bias", 1, HIDDEN),
-            ("output.weight", OUT, HIDDEN),
-            ("output.bias", 1, OUT),
-            ("log_sigma", 1, OUT),
+            ("output.weight", outputs, HIDDEN),
+            ("output.bias", 1, outputs),
+            ("log_sigma", 1, outputs),
         ]);
         Self {
             encoder,
@@ -84,6 +95,11 @@ impl ActorLayout {
             log_sigma,
             len,
         }
+    }
+
+    /// Actions of a module.
+    pub fn outputs(&self) -> usize {
+        self.output.rows
     }
 
     /// All blocks in order.
@@ -102,9 +118,9 @@ impl ActorLayout {
     }
 
     /// Initial parameters: orthogonal, gain sqrt 2 (1 for query, key and value, 0.01 for the outputs), zero bias.
-    pub fn initial(&self, run_seed: u64, sigma: f32) -> Vec<f32> {
+    pub fn initial(&self, seed: u64, sigma: f32) -> Vec<f32> {
         let mut p = vec![0.0; self.len];
-        let mut rng = stream(run_seed, Stream::Weights, 0, 0);
+        let mut rng = stream(seed, Stream::Weights, 0, 0);
         let root2 = std::f32::consts::SQRT_2;
         p[self.encoder.range()].copy_from_slice(&orthogonal(EMBED, SIZE, root2, &mut rng));
         if !self.attention.is_empty() {
@@ -120,12 +136,12 @@ impl ActorLayout {
             p[self.hidden.offset + row * EMBED..][..EMBED].copy_from_slice(&weights[..EMBED]);
             p[self.hidden_context.offset + row * context..][..context].copy_from_slice(&weights[EMBED..]);
         }
-        p[self.output.range()].copy_from_slice(&orthogonal(OUT, HIDDEN, 0.01, &mut rng));
+        p[self.output.range()].copy_from_slice(&orthogonal(self.outputs(), HIDDEN, 0.01, &mut rng));
         p[self.log_sigma.range()].fill(sigma.ln());
         p
     }
 
-    /// The network that these parameters are, with the statistics of its observations.
+    /// The network that these parameters of a control policy are, with the statistics of its observations.
     pub fn network(&self, parameters: &[f32], mean: [f32; SIZE], std: [f32; SIZE]) -> Network {
         let dense =
             |weights: Vec<f32>, inputs: usize, outputs: usize, bias: Vec<f32>| Dense { inputs, outputs, weights, bias };
@@ -209,9 +225,9 @@ impl CriticLayout {
     }
 
     /// Initial parameters: orthogonal, gain sqrt 2 (1 for the output), zero bias.
-    pub fn initial(&self, run_seed: u64) -> Vec<f32> {
+    pub fn initial(&self, seed: u64) -> Vec<f32> {
         let mut p = vec![0.0; self.len];
-        let mut rng = stream(run_seed, Stream::Weights, 1, 0);
+        let mut rng = stream(seed, Stream::Weights, 1, 0);
         for (block, gain) in [
             (self.first, std::f32::consts::SQRT_2),
             (self.second, std::f32::consts::SQRT_2),
@@ -250,7 +266,7 @@ pub struct Batch {
     pub present: Vec<usize>,
     /// Weight of each module in the actor's loss: 0 for dead modules and padding.
     pub weights: Vec<f32>,
-    /// Actions taken, `[samples, modules, OUT]`.
+    /// Actions taken, `[samples, modules, outputs]`.
     pub actions: Vec<f32>,
     /// Logarithm of the density with which each was taken, `[samples, modules]`.
     pub log_probabilities: Vec<f32>,
@@ -327,7 +343,7 @@ pub struct PpoLoss {
 }
 
 impl ActorLayout {
-    /// Means of the actions, `[samples * modules, OUT]`.
+    /// Means of the actions, `[samples * modules, outputs]`.
     fn forward(&self, p: &[Option<Tensor<2>>; 9], batch: &Batch, device: &Device) -> Tensor<2> {
         let [encoder, encoder_bias, attention, hidden, hidden_context, hidden_bias, output, output_bias, _] = p;
         let [Some(encoder), Some(encoder_bias), Some(hidden), Some(hidden_bias), Some(output), Some(output_bias)] =
@@ -376,12 +392,13 @@ impl ActorLayout {
         let column =
             |data: Vec<f32>, columns: usize| Tensor::<2>::from_data(TensorData::new(data, [rows, columns]), &device);
         let Some(log_sigma) = tensors[8].clone() else { unreachable!("log sigma is never empty") };
-        let actions = column(batch.actions.clone(), OUT);
+        let actions = column(batch.actions.clone(), self.outputs());
         let advantages = batch.advantages.iter().flat_map(|a| std::iter::repeat_n(*a, batch.modules)).collect();
         let advantages = column(advantages, 1);
         let weights = column(batch.weights.clone(), 1);
         // Constants of the density cancel in the ratio, but log sigma does not: it is being learnt.
-        let offset = batch.log_probabilities.iter().map(|l| l + LOG_DENSITY_CONSTANT).collect();
+        let constant = self.outputs() as f32 * LOG_DENSITY_CONSTANT;
+        let offset = batch.log_probabilities.iter().map(|l| l + constant).collect();
         let distance = (actions - mean) * log_sigma.clone().neg().exp();
         let log_ratio = (distance.clone() * distance).sum_dim(1) * -0.5 - log_sigma.sum_dim(1) - column(offset, 1);
         let ratio = log_ratio.clone().exp();
@@ -403,13 +420,13 @@ impl ActorLayout {
     }
 }
 
-/// ln(2 pi), of two action dimensions.
-const LOG_DENSITY_CONSTANT: f32 = 1.837_877_1;
+/// ln(2 pi) / 2, for each action dimension. Its last digit does not count: it cancels in every ratio.
+const LOG_DENSITY_CONSTANT: f32 = 0.918_938_6;
 
 /// Logarithm of the density of `action` under independent normals of mean `mean` and standard deviation exp(`log_sigma`).
-pub fn log_probability(action: [f32; OUT], mean: [f32; OUT], log_sigma: [f32; OUT]) -> f32 {
-    let mut sum = -LOG_DENSITY_CONSTANT;
-    for i in 0..OUT {
+pub fn log_probability<const A: usize>(action: [f32; A], mean: [f32; A], log_sigma: [f32; A]) -> f32 {
+    let mut sum = -(A as f32 * LOG_DENSITY_CONSTANT);
+    for i in 0..A {
         let distance = (action[i] - mean[i]) * (-log_sigma[i]).exp();
         sum -= 0.5 * distance * distance + log_sigma[i];
     }

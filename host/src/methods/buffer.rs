@@ -1,11 +1,36 @@
-//! What a rollout leaves behind: one lane per environment, advantages over it, and batches gathered from it.
+//! What a rollout leaves behind: one lane per environment and in it one track per policy, advantages over them, and batches gathered
+//! from them.
 
 use composer_shared::observation::SIZE;
 
 use super::actor_critic::{Batch, CRITIC_INPUT, OUT};
+use super::imagination::DISPLACEMENT;
 use crate::environment::{Outcome, PRIVILEGED};
 
-/// The steps of one environment in one iteration. Normalised with the statistics the policy acted with.
+/// The steps of all environments in one iteration; entry i of each list is that of environment i.
+#[derive(Clone, Debug, Default)]
+pub struct Experience {
+    /// What happened.
+    pub lanes: Vec<Lane>,
+    /// What the control policy did in it and got for it.
+    pub control: Vec<Track<OUT>>,
+    /// The same of the imagination policy; empty tracks if there is none.
+    pub imagination: Vec<Track<DISPLACEMENT>>,
+}
+
+impl Experience {
+    /// Room for so many environments.
+    pub fn new(environments: usize) -> Self {
+        Self {
+            lanes: vec![Lane::default(); environments],
+            control: vec![Track::default(); environments],
+            imagination: vec![Track::default(); environments],
+        }
+    }
+}
+
+/// The steps of one environment in one iteration, as every policy and critic sees them. Normalised with the statistics the policies
+/// acted with.
 #[derive(Clone, Debug, Default)]
 pub struct Lane {
     /// Modules of this environment.
@@ -18,12 +43,10 @@ pub struct Lane {
     pub heard: Vec<u64>,
     /// Who acted `[step][module]`.
     pub acts: Vec<bool>,
-    /// Actions, unclipped, `[step][module]`.
-    pub actions: Vec<[f32; OUT]>,
-    /// Logarithm of their density `[step][module]`.
-    pub log_probabilities: Vec<f32>,
-    /// Reward of each step.
+    /// What the task paid for each step.
     pub rewards: Vec<f32>,
+    /// How far the modules were from where they had been imagined after each step, mean, units; empty without imagination.
+    pub follow_errors: Vec<f32>,
     /// Whether the episode ended there for good.
     pub terminated: Vec<bool>,
     /// Whether it was cut off there.
@@ -35,7 +58,18 @@ pub struct Lane {
     pub final_privileged: Vec<f32>,
     /// Outcomes of the episodes that ended.
     pub episodes: Vec<Outcome>,
-    /// Advantage of each step (see [`Lane::estimate`]).
+}
+
+/// What one policy with `A` actions a module did in a lane.
+#[derive(Clone, Debug, Default)]
+pub struct Track<const A: usize> {
+    /// Actions, unclipped, `[step][module]`.
+    pub actions: Vec<[f32; A]>,
+    /// Logarithm of their density `[step][module]`.
+    pub log_probabilities: Vec<f32>,
+    /// What the policy got for each step.
+    pub rewards: Vec<f32>,
+    /// Advantage of each step (see [`Track::estimate`]).
     pub advantages: Vec<f32>,
     /// Return of each step on the reward's scale.
     pub returns: Vec<f32>,
@@ -49,34 +83,37 @@ impl Lane {
         self.privileged.clear();
         self.heard.clear();
         self.acts.clear();
-        self.actions.clear();
-        self.log_probabilities.clear();
         self.rewards.clear();
+        self.follow_errors.clear();
         self.terminated.clear();
         self.truncated.clear();
         self.final_observations.clear();
         self.final_privileged.clear();
         self.episodes.clear();
-        self.advantages.clear();
-        self.returns.clear();
     }
 
     /// Steps in the lane.
     pub fn steps(&self) -> usize {
         self.rewards.len()
     }
+}
 
-    /// How many final views there are.
-    pub fn finals(&self) -> usize {
-        self.final_observations.len() / (self.modules * SIZE).max(1)
+impl<const A: usize> Track<A> {
+    /// Empties the track.
+    pub fn clear(&mut self) {
+        self.actions.clear();
+        self.log_probabilities.clear();
+        self.rewards.clear();
+        self.advantages.clear();
+        self.returns.clear();
     }
 
-    /// Generalised advantage estimation (Schulman et al. 2016) over the lane.
+    /// Generalised advantage estimation (Schulman et al. 2016) over the lane that the track belongs to.
     ///
     /// `values` of the steps and `final_values` of the final views, both on the reward's scale. An episode that was cut off is worth
     /// what the critic says of its last view; one that terminated is worth nothing more.
-    pub fn estimate(&mut self, values: &[f32], final_values: &[f32], gamma: f32, lambda: f32) {
-        let steps = self.steps();
+    pub fn estimate(&mut self, lane: &Lane, values: &[f32], final_values: &[f32], gamma: f32, lambda: f32) {
+        let steps = lane.steps();
         self.advantages.clear();
         self.advantages.resize(steps, 0.0);
         self.returns.clear();
@@ -86,9 +123,9 @@ impl Lane {
         let mut next = finals.next().copied().unwrap_or(0.0);
         let mut advantage = 0.0;
         for t in (0..steps).rev() {
-            if self.terminated[t] {
+            if lane.terminated[t] {
                 (next, advantage) = (0.0, 0.0);
-            } else if self.truncated[t] {
+            } else if lane.truncated[t] {
                 if t + 1 < steps {
                     next = finals.next().copied().unwrap_or(0.0);
                 }
@@ -102,12 +139,12 @@ impl Lane {
     }
 }
 
-/// Gathers (lane, step) samples into a batch padded to `modules` modules.
+/// Gathers (lane, step) samples into a batch padded to `modules` modules; track i belongs to lane i.
 ///
 /// `weight` is what a module that acts weighs in the actor's loss. Everything a policy was limited by in the rollout (who heard whom,
 /// who acted) comes along, or the ratio of the new to the old policy would be wrong.
-pub fn gather(
-    lanes: &[Lane],
+pub fn gather<const A: usize>(
+    (lanes, tracks): (&[Lane], &[Track<A>]),
     samples: &[(u32, u32)],
     modules: usize,
     weight: f32,
@@ -122,13 +159,13 @@ pub fn gather(
         heard: Vec::with_capacity(rows),
         present: Vec::with_capacity(samples.len()),
         weights: Vec::with_capacity(rows),
-        actions: Vec::with_capacity(rows * OUT),
+        actions: Vec::with_capacity(rows * A),
         log_probabilities: Vec::with_capacity(rows),
         advantages: Vec::with_capacity(samples.len()),
         targets: Vec::with_capacity(samples.len()),
     };
     for (lane, step) in samples {
-        let (lane, step) = (&lanes[*lane as usize], *step as usize);
+        let (lane, track, step) = (&lanes[*lane as usize], &tracks[*lane as usize], *step as usize);
         let n = lane.modules;
         let at = step * n..(step + 1) * n;
         batch.observations.extend_from_slice(&lane.observations[step * n * SIZE..(step + 1) * n * SIZE]);
@@ -139,35 +176,36 @@ pub fn gather(
         batch.heard.extend_from_slice(&lane.heard[at.clone()]);
         batch.present.push(n);
         batch.weights.extend(lane.acts[at.clone()].iter().map(|acts| if *acts { weight } else { 0.0 }));
-        batch.actions.extend_from_slice(lane.actions[at.clone()].as_flattened());
-        batch.log_probabilities.extend_from_slice(&lane.log_probabilities[at]);
-        batch.advantages.push(lane.advantages.get(step).copied().unwrap_or(0.0));
-        batch.targets.push(target(lane.returns.get(step).copied().unwrap_or(0.0)));
-        pad(&mut batch, n);
+        batch.actions.extend_from_slice(track.actions[at.clone()].as_flattened());
+        batch.log_probabilities.extend_from_slice(&track.log_probabilities[at]);
+        batch.advantages.push(track.advantages.get(step).copied().unwrap_or(0.0));
+        batch.targets.push(target(track.returns.get(step).copied().unwrap_or(0.0)));
+        pad::<A>(&mut batch, n);
     }
     batch
 }
 
-/// A batch of a lane's final views, for the critic alone.
-pub fn gather_finals(lane: &Lane) -> Batch {
-    let (n, finals) = (lane.modules, lane.finals());
-    let mut batch = Batch { samples: finals, modules: n, present: vec![n; finals], ..Batch::default() };
-    for row in 0..finals * n {
-        batch.critic_inputs.extend_from_slice(&lane.final_observations[row * SIZE..(row + 1) * SIZE]);
-        batch.critic_inputs.extend_from_slice(&lane.final_privileged[row * PRIVILEGED..(row + 1) * PRIVILEGED]);
+/// A batch for a critic alone, of what a lane holds: `[sample][module][SIZE]` and `[sample][module][PRIVILEGED]`.
+pub fn gather_critic(modules: usize, observations: &[f32], privileged: &[f32]) -> Batch {
+    let rows = observations.len() / SIZE;
+    let samples = rows / modules.max(1);
+    let mut batch = Batch { samples, modules, present: vec![modules; samples], ..Batch::default() };
+    for row in 0..rows {
+        batch.critic_inputs.extend_from_slice(&observations[row * SIZE..(row + 1) * SIZE]);
+        batch.critic_inputs.extend_from_slice(&privileged[row * PRIVILEGED..(row + 1) * PRIVILEGED]);
     }
     batch
 }
 
 /// Fills the sample that was appended last up to the batch's number of modules: padding observes zeros, hears itself alone (its
 /// attention must not divide by zero), and is heard by nobody because no mask has its bit.
-fn pad(batch: &mut Batch, present: usize) {
+fn pad<const A: usize>(batch: &mut Batch, present: usize) {
     for module in present..batch.modules {
         batch.observations.extend_from_slice(&[0.0; SIZE]);
         batch.critic_inputs.extend_from_slice(&[0.0; CRITIC_INPUT]);
         batch.heard.push(1 << module);
         batch.weights.push(0.0);
-        batch.actions.extend_from_slice(&[0.0; OUT]);
+        batch.actions.extend_from_slice(&[0.0; A]);
         batch.log_probabilities.push(0.0);
     }
 }
@@ -178,23 +216,26 @@ mod tests {
 
     #[test]
     fn advantages_by_hand_with_termination_and_truncation() {
-        let mut lane = Lane {
+        let rewards = vec![1.0, 2.0, 3.0, 4.0, 5.0];
+        let mut track = Track::<1> { rewards: rewards.clone(), ..Track::default() };
+        let lane = Lane {
             modules: 1,
-            rewards: vec![1.0, 2.0, 3.0, 4.0, 5.0],
+            rewards,
             terminated: vec![false, true, false, false, false],
             truncated: vec![false, false, false, true, false],
             ..Lane::default()
         };
         // gamma 0.5, lambda 0.5; values 10, 20, 30, 40, 50; cut off at step 3 where the critic says 8; the lane goes on to 6.
-        lane.estimate(&[10.0, 20.0, 30.0, 40.0, 50.0], &[8.0, 6.0], 0.5, 0.5);
+        track.estimate(&lane, &[10.0, 20.0, 30.0, 40.0, 50.0], &[8.0, 6.0], 0.5, 0.5);
         // Step 4: 5 + 0.5*6 - 50 = -42.  Step 3: 4 + 0.5*8 - 40 = -32, nothing of step 4.
         // Step 2: 3 + 0.5*40 - 30 + 0.25*-32 = -15.  Step 1: 2 - 20 = -18.  Step 0: 1 + 0.5*20 - 10 + 0.25*-18 = -3.5.
-        assert_eq!(lane.advantages, [-3.5, -18.0, -15.0, -32.0, -42.0]);
-        assert_eq!(lane.returns, [6.5, 2.0, 15.0, 8.0, 8.0]);
+        assert_eq!(track.advantages, [-3.5, -18.0, -15.0, -32.0, -42.0]);
+        assert_eq!(track.returns, [6.5, 2.0, 15.0, 8.0, 8.0]);
     }
 
     #[test]
     fn a_lane_that_ends_with_an_episode_uses_that_final_view() {
+        let mut track = Track::<1> { rewards: vec![0.0, 1.0], ..Track::default() };
         let mut lane = Lane {
             modules: 1,
             rewards: vec![0.0, 1.0],
@@ -202,13 +243,13 @@ mod tests {
             truncated: vec![true, true],
             ..Lane::default()
         };
-        lane.estimate(&[1.0, 2.0], &[10.0, 20.0], 1.0, 1.0);
-        assert_eq!(lane.advantages, [9.0, 19.0]);
+        track.estimate(&lane, &[1.0, 2.0], &[10.0, 20.0], 1.0, 1.0);
+        assert_eq!(track.advantages, [9.0, 19.0]);
         lane.terminated[1] = true;
         // A terminated end needs no value, but its place among the final views is kept.
         lane.truncated[1] = false;
-        lane.estimate(&[1.0, 2.0], &[10.0, 0.0], 1.0, 1.0);
-        assert_eq!(lane.advantages, [9.0, -1.0]);
+        track.estimate(&lane, &[1.0, 2.0], &[10.0, 0.0], 1.0, 1.0);
+        assert_eq!(track.advantages, [9.0, -1.0]);
     }
 
     #[test]
@@ -219,15 +260,19 @@ mod tests {
         short.privileged = vec![2.0; 2 * 2 * PRIVILEGED];
         short.heard = vec![3; 4];
         short.acts = vec![true, false, true, true];
-        short.actions = vec![[0.5; 2]; 4];
-        short.log_probabilities = vec![-1.0; 4];
-        short.advantages = vec![1.0, 2.0];
-        short.returns = vec![3.0, 4.0];
-        let batch = gather(&[short], &[(0, 0), (0, 1)], 3, 0.25, |r| r * 2.0);
+        let track = Track {
+            actions: vec![[0.5, 0.25, -0.5]; 4],
+            log_probabilities: vec![-1.0; 4],
+            advantages: vec![1.0, 2.0],
+            returns: vec![3.0, 4.0],
+            ..Track::default()
+        };
+        let batch = gather((&[short], &[track]), &[(0, 0), (0, 1)], 3, 0.25, |r| r * 2.0);
         assert_eq!(batch.weights, [0.25, 0.0, 0.0, 0.25, 0.25, 0.0]);
         assert_eq!(batch.heard, [3, 3, 4, 3, 3, 4]);
         assert_eq!(batch.targets, [6.0, 8.0]);
         assert_eq!(batch.present, [2, 2]);
+        assert_eq!(batch.actions[3..12], [0.5, 0.25, -0.5, 0.0, 0.0, 0.0, 0.5, 0.25, -0.5]);
         assert_eq!(batch.observations.len(), 6 * SIZE);
         assert_eq!(batch.critic_inputs[CRITIC_INPUT - 1..CRITIC_INPUT + 1], [2.0, 1.0]);
         assert!(batch.critic_inputs[2 * CRITIC_INPUT..3 * CRITIC_INPUT].iter().all(|x| *x == 0.0));

@@ -1,18 +1,18 @@
-//! The actor as it runs in rollouts: plain f32, one environment at a time, no allocation, no tensor library.
+//! An actor as it runs in rollouts: plain f32, one environment at a time, no allocation, no tensor library.
 //!
 //! The arithmetic of a row never depends on how many rows there are, so the same observation always gives the same action.
 
 use composer_shared::observation::SIZE;
 
-use super::actor_critic::{ActorLayout, EMBED, HIDDEN, KEY, OUT, VALUE};
+use super::actor_critic::{ActorLayout, EMBED, HIDDEN, KEY, VALUE};
 use super::kernels::{dense, tanh};
 
 /// Query, key and value of one module in a row.
 const LATENT: usize = 2 * KEY + VALUE;
 
-/// The actor's weights, laid out for the inner loops: one row per input.
+/// The weights of an actor with `A` actions a module, laid out for the inner loops: one row per input.
 #[derive(Clone, Debug)]
-pub struct Inference {
+pub struct Inference<const A: usize> {
     encoder: Vec<f32>,
     encoder_bias: Vec<f32>,
     attention: Vec<f32>,
@@ -20,9 +20,9 @@ pub struct Inference {
     hidden_context: Vec<f32>,
     hidden_bias: Vec<f32>,
     output: Vec<f32>,
-    output_bias: [f32; OUT],
+    output_bias: [f32; A],
     /// Logarithm of the standard deviation of each action.
-    pub log_sigma: [f32; OUT],
+    pub log_sigma: [f32; A],
 }
 
 /// Working memory for [`Inference::means`].
@@ -39,11 +39,15 @@ fn transpose(weights: &[f32], rows: usize, columns: usize) -> Vec<f32> {
     (0..rows * columns).map(|i| weights[i % rows * columns + i / rows]).collect()
 }
 
-impl Inference {
+impl<const A: usize> Inference<A> {
     /// Copies the weights out of the actor's parameters.
+    ///
+    /// # Panics
+    /// If the layout has another number of actions.
     pub fn new(layout: &ActorLayout, parameters: &[f32]) -> Self {
+        assert_eq!(layout.outputs(), A, "actions of the layout");
         let transposed = |block: super::Block| transpose(&parameters[block.range()], block.rows, block.columns);
-        let pair = |block: super::Block| [parameters[block.offset], parameters[block.offset + 1]];
+        let vector = |block: super::Block| std::array::from_fn(|i| parameters[block.offset + i]);
         Self {
             encoder: transposed(layout.encoder),
             encoder_bias: parameters[layout.encoder_bias.range()].to_vec(),
@@ -52,13 +56,13 @@ impl Inference {
             hidden_context: transposed(layout.hidden_context),
             hidden_bias: parameters[layout.hidden_bias.range()].to_vec(),
             output: parameters[layout.output.range()].to_vec(),
-            output_bias: pair(layout.output_bias),
-            log_sigma: pair(layout.log_sigma),
+            output_bias: vector(layout.output_bias),
+            log_sigma: vector(layout.log_sigma),
         }
     }
 
     /// Means of the actions of a team: `observations` normalised, `[modules][SIZE]`; `heard` one mask a module, own bit set.
-    pub fn means(&self, observations: &[f32], heard: &[u64], means: &mut [[f32; OUT]], scratch: &mut Scratch) {
+    pub fn means(&self, observations: &[f32], heard: &[u64], means: &mut [[f32; A]], scratch: &mut Scratch) {
         let n = heard.len();
         let Scratch { embedding, latent, context, hidden, weights } = scratch;
         embedding.resize(n * EMBED, 0.0);

@@ -6,6 +6,7 @@
 pub mod actor_critic;
 pub mod buffer;
 pub mod fused;
+pub mod imagination;
 pub mod inference;
 pub(crate) mod kernels;
 pub mod normalise;
@@ -20,20 +21,27 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Method {
-    /// COMPOSER's self-attention over the latents of the modules heard (paper, section "Method"), without its imagination step.
+    /// COMPOSER (paper, section III): self-attention over the latents of the modules heard, and the imagination policy ([`imagination`]).
+    Composer,
+    /// COMPOSER without the imagination policy.
     ComposerNoImagination,
-    /// MAPPO: the same actor without attention; modules do not talk. PPO with one actor shared by all modules and a central critic.
+    /// COMPOSER without attention: modules do not talk.
+    ComposerNoAttention,
+    /// MAPPO: the same actor with neither. PPO with one actor shared by all modules and a central critic.
     Mappo,
 }
 
 impl Method {
     /// Every method, in the order of the documentation.
-    pub const ALL: [Method; 2] = [Method::ComposerNoImagination, Method::Mappo];
+    pub const ALL: [Method; 4] =
+        [Method::Composer, Method::ComposerNoImagination, Method::ComposerNoAttention, Method::Mappo];
 
     /// Name on the command line and in files.
     pub fn name(self) -> &'static str {
         match self {
+            Method::Composer => "composer",
             Method::ComposerNoImagination => "composer-no-imagination",
+            Method::ComposerNoAttention => "composer-no-attention",
             Method::Mappo => "mappo",
         }
     }
@@ -45,10 +53,12 @@ impl Method {
 
     /// Whether the actor attends to the latents of other modules.
     pub fn attention(self) -> bool {
-        match self {
-            Method::ComposerNoImagination => true,
-            Method::Mappo => false,
-        }
+        matches!(self, Method::Composer | Method::ComposerNoImagination)
+    }
+
+    /// Whether an imagination policy guides the training.
+    pub fn imagination(self) -> bool {
+        matches!(self, Method::Composer | Method::ComposerNoAttention)
     }
 }
 
@@ -81,6 +91,8 @@ pub enum Stream {
     Noise = 3,
     /// Order of the samples in the minibatches.
     Shuffle = 4,
+    /// Seed of all streams of the imagination policy, which stands for the run's in them.
+    Imagination = 5,
 }
 
 /// Seed of the stream `stream` of a run, numbered by (`major`, `minor`): iteration and environment, say.
@@ -296,6 +308,6 @@ mod tests {
             assert_eq!(method.name().parse::<Method>(), Ok(method));
             assert_eq!(serde_json::to_string(&method).unwrap(), format!("\"{}\"", method.name()));
         }
-        assert!("composer".parse::<Method>().unwrap_err().contains("mappo"));
+        assert!("composers".parse::<Method>().unwrap_err().contains("composer-no-attention, mappo"));
     }
 }

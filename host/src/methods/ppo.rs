@@ -6,10 +6,10 @@ use std::sync::Mutex;
 
 use rand::RngExt;
 
-use super::actor_critic::{ActorLayout, Batch, CriticLayout, Gradient, PpoLoss};
-use super::buffer::{Lane, gather, gather_finals};
+use super::actor_critic::{ActorLayout, CriticLayout, Gradient, PpoLoss};
+use super::buffer::{Lane, Track, gather, gather_critic};
 use super::normalise::ValueNorm;
-use super::{Adam, Method, Stream, clip_norm, stream};
+use super::{Adam, Stream, clip_norm, stream};
 
 /// Samples (steps of one environment) in one graph of tensors: small enough that a graph stays in the cache of a core, large enough
 /// that the overhead of a tensor operation does not count.
@@ -40,9 +40,13 @@ pub struct PpoSettings {
     pub critic_grad_norm: f32,
 }
 
-/// Everything that is learnt.
+/// One policy with its critic: everything that is learnt of it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Learner {
+    /// Where things are in the actor's parameters.
+    pub layout: ActorLayout,
+    /// Seed of its random streams.
+    pub seed: u64,
     /// The actor's parameters.
     pub actor: Vec<f32>,
     /// The critic's parameters.
@@ -56,17 +60,30 @@ pub struct Learner {
 }
 
 impl Learner {
-    /// A learner that has learnt nothing.
-    pub fn new(method: Method, run_seed: u64, sigma: f32, adam_epsilon: f32) -> Self {
-        let actor = ActorLayout::new(method).initial(run_seed, sigma);
-        let critic = CriticLayout::default().initial(run_seed);
+    /// A learner that has learnt nothing; `sigma` is the standard deviation of the actions at the start.
+    pub fn new(layout: ActorLayout, seed: u64, sigma: f32, adam_epsilon: f32) -> Self {
+        let actor = layout.initial(seed, sigma);
+        let critic = CriticLayout::default().initial(seed);
         Self {
+            layout,
+            seed,
             actor_adam: Adam::new(actor.len(), adam_epsilon),
             critic_adam: Adam::new(critic.len(), adam_epsilon),
             actor,
             critic,
             value_norm: ValueNorm::default(),
         }
+    }
+
+    /// Standard deviation of the actions as it is now, mean over their dimensions.
+    pub fn sigma(&self) -> f64 {
+        let log_sigma = &self.actor[self.layout.log_sigma.range()];
+        log_sigma.iter().map(|l| f64::from(l.exp())).sum::<f64>() / log_sigma.len() as f64
+    }
+
+    /// Whether every weight is a finite number.
+    pub fn is_finite(&self) -> bool {
+        self.actor.iter().chain(&self.critic).all(|p| p.is_finite())
     }
 }
 
@@ -93,6 +110,24 @@ pub struct UpdateStats {
     pub critic_grad_norm: f64,
     /// Minibatches of the actor before the KL stop.
     pub actor_minibatches: usize,
+}
+
+impl UpdateStats {
+    /// The numbers with the names they are logged under, CleanRL's where it has them.
+    pub fn scalars(&self) -> [(&'static str, f64); 10] {
+        [
+            ("policy_loss", self.policy_loss),
+            ("value_loss", self.value_loss),
+            ("approx_kl", self.approx_kl),
+            ("first_minibatch_kl", self.first_kl),
+            ("clipfrac", self.clip_fraction),
+            ("entropy", self.entropy),
+            ("explained_variance", self.explained_variance),
+            ("actor_grad_norm", self.actor_grad_norm),
+            ("critic_grad_norm", self.critic_grad_norm),
+            ("actor_minibatches", self.actor_minibatches as f64),
+        ]
+    }
 }
 
 /// Applies `task` to every element of `items` on `threads` threads; results in the order of the items.
@@ -126,22 +161,27 @@ fn all_samples(lanes: &[Lane]) -> Vec<(u32, u32)> {
     lanes.iter().enumerate().flat_map(|(l, lane)| (0..lane.steps()).map(move |t| (l as u32, t as u32))).collect()
 }
 
-/// Fills in the advantages and returns of all lanes. Returns the explained variance.
-pub fn estimate_advantages(lanes: &mut [Lane], learner: &Learner, settings: &PpoSettings, threads: usize) -> f64 {
+/// Fills in the advantages and returns of all tracks. Returns the explained variance.
+pub fn estimate_advantages<const A: usize>(
+    lanes: &[Lane],
+    tracks: &mut [Track<A>],
+    learner: &Learner,
+    settings: &PpoSettings,
+    threads: usize,
+) -> f64 {
     let layout = CriticLayout::default();
     let norm = learner.value_norm;
     let values = parallel(lanes, threads, |lane| {
-        let samples: Vec<_> = (0..lane.steps()).map(|t| (0, t as u32)).collect();
-        let values = |batch: &Batch| -> Vec<f32> {
-            layout.values(&learner.critic, batch).into_iter().map(|v| norm.denormalise(v)).collect()
+        let values = |observations: &[f32], privileged: &[f32]| -> Vec<f32> {
+            let batch = gather_critic(lane.modules, observations, privileged);
+            layout.values(&learner.critic, &batch).into_iter().map(|v| norm.denormalise(v)).collect()
         };
-        let steps = values(&gather(std::slice::from_ref(lane), &samples, lane.modules, 0.0, |r| r));
-        (steps, values(&gather_finals(lane)))
+        (values(&lane.observations, &lane.privileged), values(&lane.final_observations, &lane.final_privileged))
     });
     let (mut n, mut sum, mut square, mut error, mut error_square) = (0.0, 0.0, 0.0, 0.0, 0.0);
-    for (lane, (values, finals)) in lanes.iter_mut().zip(&values) {
-        lane.estimate(values, finals, settings.gamma, settings.lambda);
-        for (value, target) in values.iter().zip(&lane.returns) {
+    for ((lane, track), (values, finals)) in lanes.iter().zip(&mut *tracks).zip(&values) {
+        track.estimate(lane, values, finals, settings.gamma, settings.lambda);
+        for (value, target) in values.iter().zip(&track.returns) {
             let (target, e) = (f64::from(*target), f64::from(target - value));
             n += 1.0;
             sum += target;
@@ -154,30 +194,30 @@ pub fn estimate_advantages(lanes: &mut [Lane], learner: &Learner, settings: &Ppo
     if variance > 1e-12 { 1.0 - (error_square / n - (error / n) * (error / n)) / variance } else { 0.0 }
 }
 
-/// One iteration's learning from `lanes`.
-pub fn update(
+/// One iteration's learning of one policy from `lanes` and what it did in them.
+pub fn update<const A: usize>(
     learner: &mut Learner,
-    method: Method,
-    lanes: &mut [Lane],
+    lanes: &[Lane],
+    tracks: &mut [Track<A>],
     settings: &PpoSettings,
     learning_rate: f32,
-    (run_seed, iteration): (u64, u64),
+    iteration: u64,
     threads: usize,
 ) -> UpdateStats {
     let mut stats = UpdateStats {
-        explained_variance: estimate_advantages(lanes, learner, settings, threads),
+        explained_variance: estimate_advantages(lanes, tracks, learner, settings, threads),
         ..Default::default()
     };
-    let (actor, critic) = (ActorLayout::new(method), CriticLayout::default());
-    standardise(lanes);
+    let (actor, critic) = (learner.layout, CriticLayout::default());
+    standardise(tracks);
 
-    let returns: Vec<f32> = lanes.iter().flat_map(|lane| lane.returns.iter().copied()).collect();
+    let returns: Vec<f32> = tracks.iter().flat_map(|track| track.returns.iter().copied()).collect();
     let before = [learner.value_norm.mean(), learner.value_norm.std()];
     learner.value_norm.update(&returns);
     critic.rescale(&mut learner.critic, before, [learner.value_norm.mean(), learner.value_norm.std()]);
     let norm = learner.value_norm;
 
-    let lanes = &*lanes;
+    let tracks = &*tracks;
     let modules = lanes.iter().map(|lane| lane.modules).max().unwrap_or(0);
     let mut samples = all_samples(lanes);
     let size = samples.len().div_ceil(settings.minibatches).max(1);
@@ -185,7 +225,7 @@ pub fn update(
     let mut learning = true;
     let (mut actor_count, mut critic_count) = (0.0f64, 0.0f64);
     for epoch in 0..settings.epochs.max(settings.critic_epochs) {
-        let mut rng = stream(run_seed, Stream::Shuffle, iteration, epoch as u64);
+        let mut rng = stream(learner.seed, Stream::Shuffle, iteration, epoch as u64);
         for i in (1..samples.len()).rev() {
             samples.swap(i, rng.random_range(0..=i));
         }
@@ -206,7 +246,7 @@ pub fn update(
             let weight = 1.0 / acting.max(1) as f32;
             let chunks: Vec<_> = minibatch.chunks(CHUNK).collect();
             let gradients = parallel(&chunks, threads, |chunk| {
-                let batch = gather(lanes, chunk, modules, weight, |r| norm.normalise(r));
+                let batch = gather((lanes, tracks), chunk, modules, weight, |r| norm.normalise(r));
                 let of_actor =
                     if with_actor { actor.gradient(&learner.actor, &batch, loss) } else { Gradient::default() };
                 let of_critic = if with_critic {
@@ -264,13 +304,13 @@ pub fn update(
 }
 
 /// Gives the advantages of a batch mean 0 and standard deviation 1.
-fn standardise(lanes: &mut [Lane]) {
-    let n = lanes.iter().map(Lane::steps).sum::<usize>().max(1) as f64;
-    let all = || lanes.iter().flat_map(|lane| lane.advantages.iter().map(|a| f64::from(*a)));
+fn standardise<const A: usize>(tracks: &mut [Track<A>]) {
+    let n = tracks.iter().map(|track| track.advantages.len()).sum::<usize>().max(1) as f64;
+    let all = || tracks.iter().flat_map(|track| track.advantages.iter().map(|a| f64::from(*a)));
     let mean = all().sum::<f64>() / n;
     let std = (all().map(|a| (a - mean) * (a - mean)).sum::<f64>() / n).sqrt();
-    for lane in lanes {
-        for advantage in &mut lane.advantages {
+    for track in tracks {
+        for advantage in &mut track.advantages {
             *advantage = ((f64::from(*advantage) - mean) / (std + 1e-8)) as f32;
         }
     }
@@ -280,35 +320,50 @@ fn standardise(lanes: &mut [Lane]) {
 mod tests {
     use super::*;
     use crate::environment::{Environment, Told, Trivial};
-    use crate::methods::actor_critic::{CRITIC_INPUT, OUT};
+    use crate::methods::Method;
+    use crate::methods::actor_critic::{Batch, CRITIC_INPUT, OUT, log_probability};
+    use crate::methods::buffer::Experience;
+    use crate::methods::imagination::{DISPLACEMENT, Imagination};
     use crate::methods::inference::Inference;
     use crate::methods::normalise::Running;
     use crate::methods::rollout::{Frozen, Iteration, Slot, collect};
     use composer_shared::observation::SIZE;
 
-    /// A rollout of teams of different sizes, one of them with a dead module, under a policy that is not the initial one.
-    fn rollout(method: Method) -> (Learner, Vec<Lane>) {
-        let mut learner = Learner::new(method, 5, 0.45, 1e-5);
+    /// Learners with policies that are not the initial ones, and a rollout of theirs with teams of different sizes, one of which has a
+    /// dead module.
+    struct Rollout {
+        control: Learner,
+        imagination: Learner,
+        experience: Experience,
+    }
+
+    fn rollout(method: Method) -> Rollout {
+        let mut control = Learner::new(ActorLayout::control(method), 5, 0.45, 1e-5);
+        let mut imagination = Learner::new(ActorLayout::imagination(), 6, 0.45, 1e-5);
         let mut rng = stream(9, Stream::Weights, 7, 7);
-        learner.actor.iter_mut().chain(&mut learner.critic).for_each(|p| *p += 0.3 * (rng.random::<f32>() - 0.5));
+        for learner in [&mut control, &mut imagination] {
+            learner.actor.iter_mut().chain(&mut learner.critic).for_each(|p| *p += 0.3 * (rng.random::<f32>() - 0.5));
+        }
         let teams: [Box<dyn Environment>; 3] = [
             Box::new(Trivial::new(4, Told::Head)),
             Box::new(Trivial::new(3, Told::All)),
             Box::new(Trivial::new(5, Told::Head).with_dead(2)),
         ];
         let mut slots: Vec<_> = teams.into_iter().enumerate().map(|(i, team)| Slot::new(team, i, 5)).collect();
-        let mut lanes = vec![Lane::default(); 3];
+        let mut experience = Experience::new(3);
         let (mut observations, mut privileged) = (Running::new(SIZE), Running::new(crate::environment::PRIVILEGED));
+        let imagined_by = Inference::new(&imagination.layout, &imagination.actor);
         let iteration = Iteration {
-            policy: &Inference::new(&ActorLayout::new(method), &learner.actor),
+            policy: &Inference::new(&control.layout, &control.actor),
+            imagination: Some(Imagination { policy: &imagined_by, seed: imagination.seed, bound: 0.5, follow: 0.25 }),
             observations: Frozen::new(&observations),
             privileged: Frozen::new(&privileged),
             run_seed: 5,
             iteration: 0,
             steps: 16,
         };
-        collect(&mut slots, &mut lanes, iteration, 2, &mut observations, &mut privileged);
-        (learner, lanes)
+        collect(&mut slots, &mut experience, iteration, 2, &mut observations, &mut privileged);
+        Rollout { control, imagination, experience }
     }
 
     const SETTINGS: PpoSettings = PpoSettings {
@@ -324,41 +379,64 @@ mod tests {
         critic_grad_norm: 1.0,
     };
 
+    fn ratio_is_one<const A: usize>(name: &str, learner: &Learner, lanes: &[Lane], tracks: &[Track<A>]) {
+        let batch = gather((lanes, tracks), &all_samples(lanes), 5, 1.0, |r| r);
+        let layout = learner.layout;
+        let means = layout.means(&learner.actor, &batch);
+        let log_sigma = std::array::from_fn(|i| learner.actor[layout.log_sigma.offset + i]);
+        let mut checked = 0;
+        for (row, weight) in batch.weights.iter().enumerate() {
+            if *weight > 0.0 {
+                let vector = |v: &[f32]| -> [f32; A] { std::array::from_fn(|i| v[row * A + i]) };
+                let new = log_probability(vector(&batch.actions), vector(&means), log_sigma);
+                let ratio = (new - batch.log_probabilities[row]).exp();
+                assert!((ratio - 1.0).abs() < 1e-4, "{name} row {row}: {ratio}");
+                checked += 1;
+            }
+        }
+        assert_eq!(checked, 16 * (4 + 3 + 4));
+        // The same seen from the loss: no divergence, nothing clipped.
+        let first = layout.gradient(&learner.actor, &batch, PpoLoss { clip: 0.2 });
+        assert!(first.kl.abs() < 1e-6 && first.clipped == 0.0, "{first:?}");
+    }
+
     #[test]
     fn ratio_is_one_on_the_first_minibatch_with_masks_and_padding() {
         for method in Method::ALL {
-            let (learner, lanes) = rollout(method);
-            let batch = gather(&lanes, &all_samples(&lanes), 5, 1.0, |r| r);
-            let layout = ActorLayout::new(method);
-            let means = layout.means(&learner.actor, &batch);
-            let log_sigma = [0, 1].map(|i| learner.actor[layout.log_sigma.offset + i]);
-            let mut checked = 0;
-            for (row, weight) in batch.weights.iter().enumerate() {
-                if *weight > 0.0 {
-                    let pair = |v: &[f32]| -> [f32; OUT] { [v[row * OUT], v[row * OUT + 1]] };
-                    let new =
-                        crate::methods::actor_critic::log_probability(pair(&batch.actions), pair(&means), log_sigma);
-                    let ratio = (new - batch.log_probabilities[row]).exp();
-                    assert!((ratio - 1.0).abs() < 1e-4, "{method} row {row}: {ratio}");
-                    checked += 1;
-                }
+            let Rollout { control, imagination, experience } = rollout(method);
+            ratio_is_one(method.name(), &control, &experience.lanes, &experience.control);
+            ratio_is_one("imagination", &imagination, &experience.lanes, &experience.imagination);
+        }
+    }
+
+    #[test]
+    fn the_control_policy_pays_for_not_following() {
+        let Experience { lanes, control, imagination } = rollout(Method::Composer).experience;
+        for ((lane, control), imagination) in lanes.iter().zip(&control).zip(&imagination) {
+            assert_eq!((lane.follow_errors.len(), imagination.rewards.len()), (16, 16));
+            for (step, error) in lane.follow_errors.iter().enumerate() {
+                // Modules of this team never move: the error is how long the displacement was, on average over those that act.
+                let at = step * lane.modules..(step + 1) * lane.modules;
+                let acting =
+                    || imagination.actions[at.clone()].iter().zip(&lane.acts[at.clone()]).filter(|(_, acts)| **acts);
+                let lengths = acting().map(|(u, _)| 0.5 * u.iter().map(|x| x * x).sum::<f32>().sqrt().min(1.0));
+                let expected = lengths.sum::<f32>() / acting().count() as f32;
+                assert!((error - expected).abs() < 1e-5, "{error} {expected}");
+                assert_eq!(control.rewards[step], lane.rewards[step] - 0.25 * error);
             }
-            assert_eq!(checked, 16 * (4 + 3 + 4));
-            // The same seen from the loss: no divergence, nothing clipped.
-            let first = layout.gradient(&learner.actor, &batch, PpoLoss { clip: 0.2 });
-            assert!(first.kl.abs() < 1e-6 && first.clipped == 0.0, "{first:?}");
         }
     }
 
     #[test]
     fn attention_needs_the_masks_of_the_rollout() {
-        let (learner, lanes) = rollout(Method::ComposerNoImagination);
-        let mut batch = gather(&lanes, &all_samples(&lanes), 5, 1.0, |r| r);
-        let layout = ActorLayout::new(Method::ComposerNoImagination);
+        let Rollout { control: learner, experience: Experience { lanes, control: tracks, .. }, .. } =
+            rollout(Method::ComposerNoImagination);
+        let mut batch = gather((&lanes, &tracks), &all_samples(&lanes), 5, 1.0, |r| r);
+        let layout = learner.layout;
         let right = layout.means(&learner.actor, &batch);
         // Padding must not matter ...
-        let tight = gather(&lanes[1..2], &[(0, 3)], 3, 1.0, |r| r);
-        let loose = gather(&lanes[1..2], &[(0, 3)], 5, 1.0, |r| r);
+        let tight = gather((&lanes[1..2], &tracks[1..2]), &[(0, 3)], 3, 1.0, |r| r);
+        let loose = gather((&lanes[1..2], &tracks[1..2]), &[(0, 3)], 5, 1.0, |r| r);
         let (tight, loose) = (layout.means(&learner.actor, &tight), layout.means(&learner.actor, &loose));
         assert!(tight.iter().zip(&loose).all(|(a, b)| (a - b).abs() < 1e-6));
         // ... but who hears whom must.
@@ -368,17 +446,16 @@ mod tests {
     }
 
     /// A batch whose ratios lie on both sides of the clip, with advantages of both signs.
-    fn shaken(lanes: &mut [Lane]) -> Batch {
+    fn shaken<const A: usize>(lanes: &[Lane], tracks: &mut [Track<A>]) -> Batch {
         let mut rng = stream(3, Stream::Shuffle, 0, 0);
-        let samples = all_samples(lanes);
-        for lane in &mut *lanes {
-            lane.advantages = (0..lane.steps()).map(|_| rng.random_range(-1.0..1.0)).collect();
-            lane.returns = (0..lane.steps()).map(|_| rng.random_range(-1.0..1.0)).collect();
+        for (lane, track) in lanes.iter().zip(&mut *tracks) {
+            track.advantages = (0..lane.steps()).map(|_| rng.random_range(-1.0..1.0)).collect();
+            track.returns = (0..lane.steps()).map(|_| rng.random_range(-1.0..1.0)).collect();
             // Ratios of 0.67, 0.9, 1.1 and 1.5: none so near the edges of the clip that a small step crosses one.
             let offsets = [-0.4, -0.1, 0.1, 0.4];
-            lane.log_probabilities.iter_mut().for_each(|l| *l += offsets[rng.random_range(0..4)]);
+            track.log_probabilities.iter_mut().for_each(|l| *l += offsets[rng.random_range(0..4)]);
         }
-        gather(lanes, &samples, 5, 1.0 / 176.0, |r| 0.5 * r)
+        gather((lanes, tracks), &all_samples(lanes), 5, 1.0 / 176.0, |r| 0.5 * r)
     }
 
     /// Compares a gradient with central differences of the loss, along each of some single parameters and along the gradient.
@@ -413,57 +490,69 @@ mod tests {
         }
     }
 
+    fn clipped_loss<const A: usize>(learner: &Learner, batch: &Batch) {
+        let layout = learner.layout;
+        // The loss again, in double precision and from its formula.
+        let loss = |parameters: &[f32]| -> f64 {
+            let means = layout.means(parameters, batch);
+            let log_sigma = std::array::from_fn(|i| parameters[layout.log_sigma.offset + i]);
+            let mut sum = 0.0;
+            for row in 0..batch.weights.len() {
+                let vector = |v: &[f32]| -> [f32; A] { std::array::from_fn(|i| v[row * A + i]) };
+                let new = log_probability(vector(&batch.actions), vector(&means), log_sigma);
+                let ratio = f64::from(new - batch.log_probabilities[row]).exp();
+                let advantage = f64::from(batch.advantages[row / batch.modules]);
+                let gain = (ratio * advantage).min(ratio.clamp(0.8, 1.2) * advantage);
+                sum -= gain * f64::from(batch.weights[row]);
+            }
+            sum
+        };
+        let result = layout.gradient(&learner.actor, batch, PpoLoss { clip: 0.2 });
+        assert!((result.loss - loss(&learner.actor)).abs() < 1e-5);
+        assert!(result.clipped > 0.1 && result.clipped < 0.9, "{}", result.clipped);
+        against_differences(&learner.actor, &result.gradient, loss, &layout.blocks());
+    }
+
     #[test]
     fn the_gradient_of_the_clipped_loss_is_its_slope() {
-        for method in Method::ALL {
-            let (learner, mut lanes) = rollout(method);
-            let batch = shaken(&mut lanes);
-            let layout = ActorLayout::new(method);
-            // The loss again, in double precision and from its formula.
-            let loss = |parameters: &[f32]| -> f64 {
-                let means = layout.means(parameters, &batch);
-                let log_sigma = [0, 1].map(|i| parameters[layout.log_sigma.offset + i]);
-                let mut sum = 0.0;
-                for row in 0..batch.weights.len() {
-                    let pair = |v: &[f32]| -> [f32; OUT] { [v[row * OUT], v[row * OUT + 1]] };
-                    let new =
-                        crate::methods::actor_critic::log_probability(pair(&batch.actions), pair(&means), log_sigma);
-                    let ratio = f64::from(new - batch.log_probabilities[row]).exp();
-                    let advantage = f64::from(batch.advantages[row / batch.modules]);
-                    let gain = (ratio * advantage).min(ratio.clamp(0.8, 1.2) * advantage);
-                    sum -= gain * f64::from(batch.weights[row]);
-                }
-                sum
-            };
-            let result = layout.gradient(&learner.actor, &batch, PpoLoss { clip: 0.2 });
-            assert!((result.loss - loss(&learner.actor)).abs() < 1e-5);
-            assert!(result.clipped > 0.1 && result.clipped < 0.9, "{}", result.clipped);
-            against_differences(&learner.actor, &result.gradient, loss, &layout.blocks());
+        // With attention and without.
+        for method in [Method::Composer, Method::Mappo] {
+            let Rollout {
+                control,
+                imagination,
+                experience: Experience { lanes, control: mut of_control, imagination: mut of_imagination },
+            } = rollout(method);
+            clipped_loss::<OUT>(&control, &shaken(&lanes, &mut of_control));
+            clipped_loss::<DISPLACEMENT>(&imagination, &shaken(&lanes, &mut of_imagination));
         }
+    }
+
+    /// Some critic, and a batch.
+    fn critic() -> (Vec<f32>, Batch) {
+        let Rollout { control, experience: Experience { lanes, control: mut tracks, .. }, .. } = rollout(Method::Mappo);
+        (control.critic, shaken(&lanes, &mut tracks))
     }
 
     #[test]
     fn the_gradient_of_the_value_loss_is_its_slope() {
-        let (learner, mut lanes) = rollout(Method::Mappo);
-        let batch = shaken(&mut lanes);
+        let (critic, batch) = critic();
         let layout = CriticLayout::default();
         let loss = |parameters: &[f32]| -> f64 {
             let values = layout.values(parameters, &batch);
             values.iter().zip(&batch.targets).map(|(v, t)| 0.25 * f64::from(v - t).powi(2)).sum()
         };
-        let result = layout.gradient(&learner.critic, &batch, 0.5);
-        assert!((result.loss - loss(&learner.critic)).abs() < 1e-4);
-        against_differences(&learner.critic, &result.gradient, loss, &layout.blocks());
+        let result = layout.gradient(&critic, &batch, 0.5);
+        assert!((result.loss - loss(&critic)).abs() < 1e-4);
+        against_differences(&critic, &result.gradient, loss, &layout.blocks());
     }
 
     #[test]
     fn rescaling_the_critic_keeps_its_values() {
-        let (mut learner, mut lanes) = rollout(Method::Mappo);
-        let batch = shaken(&mut lanes);
+        let (mut critic, batch) = critic();
         let layout = CriticLayout::default();
-        let before = layout.values(&learner.critic, &batch);
-        layout.rescale(&mut learner.critic, [1.0, 2.0], [-3.0, 5.0]);
-        let after = layout.values(&learner.critic, &batch);
+        let before = layout.values(&critic, &batch);
+        layout.rescale(&mut critic, [1.0, 2.0], [-3.0, 5.0]);
+        let after = layout.values(&critic, &batch);
         for (before, after) in before.iter().zip(&after) {
             assert!((before * 2.0 + 1.0 - (after * 5.0 - 3.0)).abs() < 1e-4);
         }
@@ -473,23 +562,27 @@ mod tests {
     #[test]
     fn an_update_does_not_depend_on_the_threads() {
         let results = [1, 2, 3].map(|threads| {
-            let (mut learner, mut lanes) = rollout(Method::ComposerNoImagination);
-            let stats =
-                update(&mut learner, Method::ComposerNoImagination, &mut lanes, &SETTINGS, 1e-3, (5, 0), threads);
-            (learner, stats)
+            let Rollout { mut control, mut imagination, mut experience } = rollout(Method::Composer);
+            let Experience { lanes, control: of_control, imagination: of_imagination } = &mut experience;
+            let stats = [
+                update(&mut control, lanes, of_control, &SETTINGS, 1e-3, 0, threads),
+                update(&mut imagination, lanes, of_imagination, &SETTINGS, 1e-3, 0, threads),
+            ];
+            (control, imagination, stats)
         });
         assert_eq!(results[0], results[1]);
         assert_eq!(results[0], results[2]);
-        let stats = results[0].1;
-        assert_eq!(stats.actor_minibatches, 4);
-        assert!(stats.first_kl.abs() < 1e-6, "{stats:?}");
+        for stats in results[0].2 {
+            assert_eq!(stats.actor_minibatches, 4);
+            assert!(stats.first_kl.abs() < 1e-6, "{stats:?}");
+        }
     }
 
     #[test]
     fn the_actor_stops_at_the_kl_limit() {
-        let (mut learner, mut lanes) = rollout(Method::Mappo);
+        let Rollout { control: mut learner, mut experience, .. } = rollout(Method::Mappo);
         let settings = PpoSettings { kl_stop: 1e-4, epochs: 10, ..SETTINGS };
-        let stats = update(&mut learner, Method::Mappo, &mut lanes, &settings, 1e-2, (5, 0), 1);
+        let stats = update(&mut learner, &experience.lanes, &mut experience.control, &settings, 1e-2, 0, 1);
         assert!(stats.actor_minibatches < 20 && stats.approx_kl > 1e-4, "{stats:?}");
         assert_eq!(learner.critic_adam.steps, 4);
         assert_eq!(learner.actor_adam.steps, stats.actor_minibatches as u64);

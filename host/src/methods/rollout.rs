@@ -6,9 +6,11 @@ use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 use composer_shared::observation::{Observation, SIZE};
+use rand_chacha::ChaCha8Rng;
 
 use super::actor_critic::{OUT, log_probability};
-use super::buffer::Lane;
+use super::buffer::{Experience, Lane, Track};
+use super::imagination::{DISPLACEMENT, Imagination, follow_error};
 use super::inference::{Inference, Scratch};
 use super::normalise::Running;
 use super::{Stream, derive_seed, normal_pair, stream};
@@ -96,8 +98,10 @@ impl<const N: usize> Frozen<N> {
 /// What all environments of an iteration have in common.
 #[derive(Clone, Copy)]
 pub struct Iteration<'a> {
-    /// The actor.
-    pub policy: &'a Inference,
+    /// The control policy's actor.
+    pub policy: &'a Inference<OUT>,
+    /// The imagination policy, if the method has one.
+    pub imagination: Option<Imagination<'a>>,
     /// Statistics of the observations.
     pub observations: Frozen<SIZE>,
     /// Statistics of the privileged numbers.
@@ -119,26 +123,28 @@ pub struct Split {
     pub inference: Duration,
 }
 
-/// Runs an iteration: fills `lanes` (one per slot) and takes what was seen into `observations` and `privileged`.
+/// Runs an iteration: fills `experience` (as many environments as slots) and takes what was seen into `observations` and `privileged`.
 pub fn collect(
     slots: &mut [Slot],
-    lanes: &mut [Lane],
+    experience: &mut Experience,
     iteration: Iteration,
     threads: usize,
     observations: &mut Running,
     privileged: &mut Running,
 ) -> Split {
     let split = {
-        let work = Mutex::new(slots.iter_mut().zip(lanes.iter_mut()));
+        let Experience { lanes, control, imagination } = experience;
+        let tracks = control.iter_mut().zip(imagination);
+        let work = Mutex::new(slots.iter_mut().zip(lanes).zip(tracks));
         let worker = || {
             let mut split = Split::default();
             let mut scratch = Scratch::default();
             loop {
                 // The lock is held only to take the next environment; no panic can happen inside.
                 let next = work.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).next();
-                let Some((slot, lane)) = next else { return split };
+                let Some(((slot, lane), (control, imagination))) = next else { return split };
                 let began = Instant::now();
-                let physics = run(slot, lane, &iteration, &mut scratch);
+                let physics = run(slot, lane, control, imagination, &iteration, &mut scratch);
                 split.physics += physics;
                 split.inference += began.elapsed().saturating_sub(physics);
             }
@@ -166,15 +172,62 @@ pub fn collect(
     split
 }
 
+/// One policy in the rollout of one environment.
+struct Player<'a, const A: usize> {
+    policy: &'a Inference<A>,
+    track: &'a mut Track<A>,
+    rng: ChaCha8Rng,
+    means: Vec<[f32; A]>,
+    sigma: [f32; A],
+}
+
+impl<'a, const A: usize> Player<'a, A> {
+    fn new(policy: &'a Inference<A>, track: &'a mut Track<A>, rng: ChaCha8Rng, modules: usize) -> Self {
+        Self { policy, track, rng, means: vec![[0.0; A]; modules], sigma: policy.log_sigma.map(f32::exp) }
+    }
+
+    /// Draws an action for each module from what it observes and hears, and returns them all.
+    fn act(&mut self, observations: &[f32], heard: &[u64], scratch: &mut Scratch) -> &[[f32; A]] {
+        let log_sigma = self.policy.log_sigma;
+        let first = self.track.actions.len();
+        self.policy.means(observations, heard, &mut self.means, scratch);
+        for mean in &self.means {
+            // Numbers come in pairs; the last is thrown away if there is an odd number of actions.
+            let mut pair = [0.0; 2];
+            let action = std::array::from_fn(|i| {
+                if i % 2 == 0 {
+                    pair = normal_pair(&mut self.rng);
+                }
+                mean[i] + self.sigma[i] * pair[i % 2]
+            });
+            self.track.actions.push(action);
+            self.track.log_probabilities.push(log_probability(action, *mean, log_sigma));
+        }
+        &self.track.actions[first..]
+    }
+}
+
 /// The steps of one environment. Returns the time spent in it.
-fn run(slot: &mut Slot, lane: &mut Lane, iteration: &Iteration, scratch: &mut Scratch) -> Duration {
+fn run(
+    slot: &mut Slot,
+    lane: &mut Lane,
+    control: &mut Track<OUT>,
+    imagination: &mut Track<DISPLACEMENT>,
+    iteration: &Iteration,
+    scratch: &mut Scratch,
+) -> Duration {
     let n = slot.modules;
     let mut physics = Duration::ZERO;
-    let mut means = vec![[0.0; OUT]; n];
-    let mut rng = stream(iteration.run_seed, Stream::Noise, iteration.iteration, slot.index as u64);
-    let log_sigma = iteration.policy.log_sigma;
-    let sigma = log_sigma.map(f32::exp);
+    let index = slot.index as u64;
+    let noise = |seed| stream(seed, Stream::Noise, iteration.iteration, index);
     lane.clear(n);
+    control.clear();
+    imagination.clear();
+    let mut control = Player::new(iteration.policy, control, noise(iteration.run_seed), n);
+    let mut imagination = iteration
+        .imagination
+        .map(|settings| (settings, Player::new(settings.policy, imagination, noise(settings.seed), n)));
+    let mut imagined = Vec::with_capacity(n);
     for step in 0..iteration.steps {
         let first = lane.observations.len();
         for module in 0..n {
@@ -185,18 +238,29 @@ fn run(slot: &mut Slot, lane: &mut Lane, iteration: &Iteration, scratch: &mut Sc
             lane.heard.push(slot.view.heard[module] | 1 << module);
         }
         lane.acts.extend_from_slice(&slot.view.acts);
-        iteration.policy.means(&lane.observations[first..], &lane.heard[step * n..], &mut means, scratch);
-        for mean in &means {
-            let noise = normal_pair(&mut rng);
-            let action = std::array::from_fn(|i| mean[i] + sigma[i] * noise[i]);
-            lane.actions.push(action);
-            lane.log_probabilities.push(log_probability(action, *mean, log_sigma));
+        let (observations, heard, acts) =
+            (&lane.observations[first..], &lane.heard[step * n..], &lane.acts[step * n..]);
+        if let Some((settings, player)) = &mut imagination {
+            let actions = player.act(observations, heard, scratch);
+            settings.imagine(&*slot.environment, acts, actions, &mut imagined);
+            player.track.rewards.push(slot.environment.imagined_reward(&imagined));
         }
-        let actions = &lane.actions[step * n..];
+        let actions = control.act(observations, heard, scratch);
         slot.actions.extend_from_slice(actions);
 
         let began = Instant::now();
         let outcome = slot.environment.step(actions);
+        physics += began.elapsed();
+        let mut reward = outcome.reward;
+        if let Some((settings, _)) = &imagination {
+            let error = follow_error(&*slot.environment, acts, &imagined);
+            lane.follow_errors.push(error);
+            reward -= settings.follow * error;
+        }
+        control.track.rewards.push(reward);
+        lane.rewards.push(outcome.reward);
+
+        let began = Instant::now();
         let truncated = outcome.truncated && !outcome.terminated;
         let last = step + 1 == iteration.steps;
         if outcome.terminated || truncated {
@@ -212,7 +276,6 @@ fn run(slot: &mut Slot, lane: &mut Lane, iteration: &Iteration, scratch: &mut Sc
         slot.environment.view(&mut slot.view);
         physics += began.elapsed();
 
-        lane.rewards.push(outcome.reward);
         lane.terminated.push(outcome.terminated);
         lane.truncated.push(truncated);
         if last && !truncated {

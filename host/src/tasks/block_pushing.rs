@@ -47,7 +47,7 @@ pub struct BlockPushing {
 impl Default for BlockPushing {
     fn default() -> Self {
         BlockPushing {
-            block_size: [1.5, 1.5, 1.0],
+            block_size: [2.0, 2.0, 1.0],
             block_mass: 0.01,
             block_friction: 0.5,
             block_distance: [3.0, 6.0],

@@ -4,9 +4,10 @@
 //! |---|---|
 //! | start | straight, at rest, head at the origin, facing +x |
 //! | targets | one a module, a module's length apart along a curve: line, arc, C, S, U, ring or spiral, bent to either side; its middle up to `place` units from the snake's, turned by up to `heading` |
+//! | | targets lie at least 1.6 times the success distance from the modules, in the mean: the snake must move |
 //! | reward `paper` | `-sum_i d(module_i, target_i)` |
 //! | left to do (`progress`) | `sum_i d(module_i, target_i)` |
-//! | success | mean over the modules of `d(module_i, target_i)` < 1 unit: the paper's sum is below `n d_g`; ends the episode |
+//! | success | mean over the modules of `d(module_i, target_i)` < 1.25 units: the paper's sum is below `n d_g`; ends the episode |
 //! | points on the bus | i: the target of module i |
 //! | imagined distance | Wasserstein distance between `p'` and the targets: the least mean distance over all assignments |
 //!
@@ -22,49 +23,63 @@ use super::{Course, Gate, Point, Rules, Verdict, check_number, distance, either_
 use crate::robot::Robot;
 use crate::sim::{Scene, Snake};
 
+/// Targets lie at least this many times the success distance from the modules at the start, in the mean.
+const START_APART: f32 = 1.6;
+
 /// Settings of the task.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ShapeFormation {
+    /// The shapes that are drawn from, evenly.
+    pub shapes: Vec<Shape>,
     /// Farthest that the middle of the shape lies from the middle of the snake at the start, units.
     pub place: f32,
     /// The shape's direction from tail to head lies within this angle to either side of the snake's at the start, degrees.
     pub heading: f32,
-    /// Mean distance of the modules to their targets that counts as formed, units.
+    /// Mean distance of the modules to their targets that counts as formed, units; a module is 2 units long.
     pub success_distance: f32,
 }
 
 impl Default for ShapeFormation {
     fn default() -> Self {
-        ShapeFormation { place: 3.0, heading: 45.0, success_distance: 1.0 }
+        ShapeFormation { shapes: Shape::ALL.to_vec(), place: 2.0, heading: 30.0, success_distance: 1.25 }
     }
 }
 
-/// Kinds of shapes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Kind {
+/// Kinds of shapes, by what their curvature does from head to tail.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Shape {
+    /// None.
     Line,
+    /// The same all along, up to a bit over a right angle.
     Arc,
+    /// The same all along, about half a circle.
     C,
+    /// To one side, then to the other.
     S,
+    /// Straight legs and half a circle between them.
     U,
+    /// Nearly a full circle.
     Ring,
+    /// Tighter and tighter, about a full circle.
     Spiral,
 }
 
-impl Kind {
-    const ALL: [Kind; 7] = [Kind::Line, Kind::Arc, Kind::C, Kind::S, Kind::U, Kind::Ring, Kind::Spiral];
+impl Shape {
+    /// All of them.
+    pub const ALL: [Shape; 7] = [Shape::Line, Shape::Arc, Shape::C, Shape::S, Shape::U, Shape::Ring, Shape::Spiral];
 
     /// Least and most angle that the curve turns through, degrees.
     fn bend(self) -> [f32; 2] {
         match self {
-            Kind::Line => [0.0, 0.0],
-            Kind::Arc => [45.0, 110.0],
-            Kind::C => [150.0, 240.0],
-            Kind::S => [80.0, 150.0],
-            Kind::U => [160.0, 190.0],
-            Kind::Ring => [300.0, 320.0],
-            Kind::Spiral => [330.0, 400.0],
+            Shape::Line => [0.0, 0.0],
+            Shape::Arc => [45.0, 110.0],
+            Shape::C => [150.0, 240.0],
+            Shape::S => [80.0, 150.0],
+            Shape::U => [160.0, 190.0],
+            Shape::Ring => [300.0, 320.0],
+            Shape::Spiral => [240.0, 320.0],
         }
     }
 
@@ -81,19 +96,19 @@ impl Kind {
     /// Share of the bend that is done at share `u` of the length, 0 to 1 both.
     fn turned(self, u: f32) -> f32 {
         match self {
-            Kind::Line | Kind::Arc | Kind::C | Kind::Ring => u,
+            Shape::Line | Shape::Arc | Shape::C | Shape::Ring => u,
             // There and back again: the curvature changes its sign in the middle.
-            Kind::S => 1.0 - (2.0 * u - 1.0).abs(),
+            Shape::S => 1.0 - (2.0 * u - 1.0).abs(),
             // Straight legs of a third each.
-            Kind::U => (3.0 * u - 1.0).clamp(0.0, 1.0),
+            Shape::U => (3.0 * u - 1.0).clamp(0.0, 1.0),
             // Tighter and tighter.
-            Kind::Spiral => 0.35 * u + 0.65 * u * u,
+            Shape::Spiral => 0.35 * u + 0.65 * u * u,
         }
     }
 }
 
 /// `count` points on a curve, `spacing` apart along it, from the origin along x.
-fn curve(kind: Kind, bend: f32, count: usize, spacing: f32) -> Vec<[f32; 2]> {
+fn curve(kind: Shape, bend: f32, count: usize, spacing: f32) -> Vec<[f32; 2]> {
     const FINE: usize = 32;
     let length = (count - 1).max(1) as f32 * spacing;
     let step = spacing / FINE as f32;
@@ -110,8 +125,19 @@ fn curve(kind: Kind, bend: f32, count: usize, spacing: f32) -> Vec<[f32; 2]> {
     points
 }
 
+/// Where the modules are at the start.
+fn start_positions(robot: &Robot) -> Vec<Point> {
+    let own = composer_shared::robot::Geometry::OWN_LINK.min(robot.links_per_module - 1);
+    let link = |module: usize| (module * robot.links_per_module + own) as f32;
+    (0..robot.modules).map(|module| [-link(module) * robot.link_length, 0.0, robot.link_radius]).collect()
+}
+
+fn mean_distance(positions: &[Point], targets: &[Point]) -> f32 {
+    positions.iter().zip(targets).map(|(p, t)| distance(*p, *t)).sum::<f32>() / targets.len().max(1) as f32
+}
+
 impl ShapeFormation {
-    fn targets(kind: Kind, seed_rng: &mut ChaCha8Rng, robot: &Robot, place: f32, heading: f32) -> Vec<Point> {
+    fn targets(kind: Shape, seed_rng: &mut ChaCha8Rng, robot: &Robot, place: f32, heading: f32) -> Vec<Point> {
         let [least, most] = kind.bend();
         let side = if seed_rng.random() { 1.0 } else { -1.0 };
         let bend = (least + (most - least) * seed_rng.random::<f32>()).to_radians();
@@ -129,9 +155,8 @@ impl ShapeFormation {
         let (sin, cos) = libm::sincosf(turn);
         let (away, bearing) = (place * libm::sqrtf(seed_rng.random::<f32>()), 2.0 * PI * seed_rng.random::<f32>());
         let (by, bx) = libm::sincosf(bearing);
-        // The own link of the first module lies behind the head.
-        let own = composer_shared::robot::Geometry::OWN_LINK.min(robot.links_per_module - 1) as f32;
-        let snake_middle = -own * robot.link_length - 0.5 * (n - 1.0) * spacing;
+        let start = start_positions(robot);
+        let snake_middle = 0.5 * (start[0][0] + start[start.len() - 1][0]);
         points
             .iter()
             .map(|p| {
@@ -147,6 +172,9 @@ impl Rules for ShapeFormation {
         if robot.modules < 3 {
             return Err(format!("{} modules cannot form a shape; at least 3 are needed", robot.modules));
         }
+        if self.shapes.is_empty() {
+            return Err("shapes = []; at least one shape is needed, such as \"line\"".into());
+        }
         check_number("place", self.place, [0.0, 50.0])?;
         check_number("heading", self.heading, [0.0, 180.0])?;
         check_number("success_distance", self.success_distance, [0.01, 100.0])
@@ -158,8 +186,16 @@ impl Rules for ShapeFormation {
 
     fn course(&self, seed: u64, robot: &Robot) -> Course {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let kind = Kind::ALL[rng.random_range(0..Kind::ALL.len())];
-        let marks = Self::targets(kind, &mut rng, robot, self.place, self.heading);
+        let start = start_positions(robot);
+        // A shape that the straight snake has nearly got already is no task. A shape with a bend always comes within a few draws; lines
+        // alone with little room to be placed in never might.
+        let marks = (0..100)
+            .map(|_| {
+                let kind = self.shapes[rng.random_range(0..self.shapes.len())];
+                Self::targets(kind, &mut rng, robot, self.place, self.heading)
+            })
+            .find(|targets| mean_distance(&start, targets) >= START_APART * self.success_distance);
+        let marks = marks.unwrap_or_else(|| Self::targets(self.shapes[0], &mut rng, robot, self.place, self.heading));
         let n = marks.len() as f32;
         let goal = [0, 1, 2].map(|axis| marks.iter().map(|p| p[axis]).sum::<f32>() / n);
         Course { scene: Scene::default(), goal, marks }
@@ -170,9 +206,9 @@ impl Rules for ShapeFormation {
     }
 
     fn verdict(&self, course: &Course, snake: &Snake, _gate: &mut Gate) -> Verdict {
-        let apart = course.marks.iter().enumerate().map(|(m, target)| distance(snake.module_position(m), *target));
-        let sum: f32 = apart.sum();
-        let mean = sum / course.marks.len().max(1) as f32;
+        let positions: Vec<Point> = (0..snake.robot().modules).map(|m| snake.module_position(m)).collect();
+        let mean = mean_distance(&positions, &course.marks);
+        let sum = mean * course.marks.len() as f32;
         Verdict { paper: -sum, left: sum, distance: mean, success: mean < self.success_distance }
     }
 

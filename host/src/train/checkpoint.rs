@@ -1,6 +1,6 @@
 //! The checkpoint: one file with all that a run needs to go on bit for bit.
 //!
-//! Layout, little-endian: magic `CMPSRCK1`, then the fields of [`Checkpoint`] in order (lists and texts after
+//! Layout, little-endian: magic `CMPSRCK2`, then the fields of [`Checkpoint`] in order (lists and texts after
 //! their length as u64), then the CRC-32 of everything before.
 //! A new one is written beside the old one, made durable and renamed, so that there is a whole one at every moment.
 
@@ -16,7 +16,9 @@ use crate::methods::actor_critic::OUT;
 /// File name of the checkpoint in the folder of a run.
 pub const FILE: &str = "checkpoint.bin";
 
-const MAGIC: &[u8; 8] = b"CMPSRCK1";
+const MAGIC: &[u8; 8] = b"CMPSRCK2";
+/// How the magic numbers of all versions begin.
+const FAMILY: &[u8] = b"CMPSRCK";
 const CRC: crc::Crc<u32> = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC);
 
 /// Why a checkpoint was not read or written.
@@ -29,8 +31,13 @@ pub enum CheckpointError {
     #[error("the checkpoint {0} cannot be read: {1}")]
     Read(String, io::Error),
     /// Not a checkpoint.
-    #[error("{0} is no training checkpoint of this program (it does not start with CMPSRCK1)")]
+    #[error("{0} is no training checkpoint of this program (it does not start with CMPSRCK2)")]
     Magic(String),
+    /// Of another version.
+    #[error(
+        "the checkpoint {0} was written by another version of this program; only that version can go on with it. Its policy (network.json) can still be used"
+    )]
+    Version(String),
     /// Damaged.
     #[error("the checkpoint {0} is damaged (its checksum is wrong); it cannot be resumed from")]
     Damaged(String),
@@ -50,6 +57,17 @@ pub struct Episode {
     pub actions: Vec<[f32; OUT]>,
 }
 
+/// One policy and its critic.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct LearnerState {
+    /// Steps taken by the actor's and the critic's optimiser.
+    pub adam_steps: [u64; 2],
+    /// Parameters, then both moments of Adam: of the actor, then of the critic.
+    pub parameters: [Vec<f32>; 6],
+    /// Statistics of the returns.
+    pub value_norm: [f64; 3],
+}
+
 /// The state of a run between two iterations.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Checkpoint {
@@ -59,11 +77,9 @@ pub struct Checkpoint {
     pub fingerprint: String,
     /// Iterations done.
     pub iteration: u64,
-    /// Steps taken by the actor's and the critic's optimiser.
-    pub adam_steps: [u64; 2],
-    /// Parameters, then both moments of Adam: of the actor, then of the critic.
-    pub parameters: [Vec<f32>; 6],
-    /// Statistics: whatever numbers the normalisers are made of.
+    /// The control policy, then the imagination policy if the method has one.
+    pub learners: Vec<LearnerState>,
+    /// Statistics: whatever numbers the normalisers of the observations are made of.
     pub statistics: Vec<f64>,
     /// One entry per environment.
     pub episodes: Vec<Episode>,
@@ -78,10 +94,14 @@ impl Checkpoint {
             out.extend_from_slice(text.as_bytes());
         }
         number(&mut out, self.iteration);
-        self.adam_steps.iter().for_each(|steps| number(&mut out, *steps));
-        for parameters in &self.parameters {
-            number(&mut out, parameters.len() as u64);
-            parameters.iter().for_each(|p| out.extend_from_slice(&p.to_le_bytes()));
+        number(&mut out, self.learners.len() as u64);
+        for learner in &self.learners {
+            learner.adam_steps.iter().for_each(|steps| number(&mut out, *steps));
+            for parameters in &learner.parameters {
+                number(&mut out, parameters.len() as u64);
+                parameters.iter().for_each(|p| out.extend_from_slice(&p.to_le_bytes()));
+            }
+            learner.value_norm.iter().for_each(|n| out.extend_from_slice(&n.to_le_bytes()));
         }
         number(&mut out, self.statistics.len() as u64);
         self.statistics.iter().for_each(|s| out.extend_from_slice(&s.to_le_bytes()));
@@ -100,9 +120,15 @@ impl Checkpoint {
         let mut reader = Reader(body);
         let mut checkpoint = Self { config: reader.text()?, fingerprint: reader.text()?, ..Self::default() };
         checkpoint.iteration = reader.number()?;
-        checkpoint.adam_steps = [reader.number()?, reader.number()?];
-        for parameters in &mut checkpoint.parameters {
-            *parameters = reader.floats(1)?;
+        for _ in 0..reader.length(16)? {
+            let mut learner = LearnerState { adam_steps: [reader.number()?, reader.number()?], ..Default::default() };
+            for parameters in &mut learner.parameters {
+                *parameters = reader.floats(1)?;
+            }
+            for number in &mut learner.value_norm {
+                *number = f64::from_bits(reader.number()?);
+            }
+            checkpoint.learners.push(learner);
         }
         let count = reader.length(8)?;
         checkpoint.statistics = (0..count).map(|_| reader.number().map(f64::from_bits)).collect::<Option<_>>()?;
@@ -126,7 +152,13 @@ impl Checkpoint {
             }
             Err(error) => return Err(CheckpointError::Read(name, error)),
         };
-        let Some(body) = bytes.strip_prefix(MAGIC) else { return Err(CheckpointError::Magic(name)) };
+        let Some(body) = bytes.strip_prefix(MAGIC) else {
+            return Err(if bytes.starts_with(FAMILY) {
+                CheckpointError::Version(name)
+            } else {
+                CheckpointError::Magic(name)
+            });
+        };
         let Some((body, checksum)) = body.split_last_chunk::<4>() else { return Err(CheckpointError::Damaged(name)) };
         if CRC.checksum(&bytes[..bytes.len() - 4]) != u32::from_le_bytes(*checksum) {
             return Err(CheckpointError::Damaged(name));
@@ -184,8 +216,13 @@ mod tests {
             config: "seed = 1".into(),
             fingerprint: "snake".into(),
             iteration: 3,
-            adam_steps: [7, 8],
-            parameters: std::array::from_fn(|i| vec![0.1 * i as f32, f32::MIN_POSITIVE, -0.0]),
+            learners: [7, 9]
+                .map(|n| LearnerState {
+                    adam_steps: [n, n + 1],
+                    parameters: std::array::from_fn(|i| vec![0.1 * i as f32, f32::MIN_POSITIVE, -(n as f32)]),
+                    value_norm: [0.1 * n as f64, -0.0, f64::MAX],
+                })
+                .into(),
             statistics: vec![1.0 / 3.0, f64::EPSILON],
             episodes: vec![
                 Episode { number: 5, actions: vec![[0.1, -7.5], [1e-30, 2.0]] },
@@ -212,10 +249,20 @@ mod tests {
             bytes[i] ^= 1 << (i % 8);
             fs::write(&path, &bytes).unwrap();
             let error = Checkpoint::read(folder.path()).unwrap_err();
-            assert_eq!(matches!(error, CheckpointError::Magic(_)), i < 8, "byte {i}: {error}");
+            let version = i == FAMILY.len();
+            assert_eq!(matches!(error, CheckpointError::Magic(_)), i < 8 && !version, "byte {i}: {error}");
+            assert_eq!(matches!(error, CheckpointError::Version(_)), version, "byte {i}: {error}");
             fs::write(&path, &whole[..i]).unwrap();
             assert!(Checkpoint::read(folder.path()).is_err(), "cut to {i} bytes");
         }
+    }
+
+    #[test]
+    fn one_of_an_older_version_is_refused_as_such() {
+        let folder = tempfile::tempdir().unwrap();
+        fs::write(folder.path().join(FILE), b"CMPSRCK1 and whatever it held").unwrap();
+        let error = Checkpoint::read(folder.path()).unwrap_err().to_string();
+        assert!(error.contains("another version of this program"), "{error}");
     }
 
     #[test]

@@ -14,17 +14,18 @@ use anyhow::{Context, Result, bail};
 use composer_shared::observation::SIZE;
 use serde::{Deserialize, Serialize};
 
-use self::checkpoint::{Checkpoint, Episode};
+use self::checkpoint::{Checkpoint, Episode, LearnerState};
 use self::metrics::Metrics;
 use self::progress::{Progress, Times};
 use crate::environment::{Environment, PRIVILEGED};
-use crate::methods::Method;
 use crate::methods::actor_critic::ActorLayout;
-use crate::methods::buffer::Lane;
+use crate::methods::buffer::Experience;
+use crate::methods::imagination::{Imagination, ImaginationConfig};
 use crate::methods::inference::Inference;
 use crate::methods::normalise::{Running, ValueNorm};
 use crate::methods::ppo::{Learner, PpoSettings, update};
 use crate::methods::rollout::{Frozen, Iteration, Slot, collect};
+use crate::methods::{Method, Stream, derive_seed};
 use crate::network::Network;
 
 /// Settings of the learner. Every field has a default, so that a TOML file needs to name only what it changes.
@@ -77,12 +78,14 @@ pub struct TrainConfig {
     pub checkpoint_seconds: f64,
     /// Threads; 0 for one per core. The result does not depend on it.
     pub threads: usize,
+    /// The imagination policy, for the methods that have one.
+    pub imagination: ImaginationConfig,
 }
 
 impl Default for TrainConfig {
     fn default() -> Self {
         Self {
-            method: Method::ComposerNoImagination,
+            method: Method::Composer,
             seed: 1,
             total_steps: 1_000_000,
             environments: 32,
@@ -105,6 +108,7 @@ impl Default for TrainConfig {
             evaluation_episodes: 50,
             checkpoint_seconds: 60.0,
             threads: 0,
+            imagination: ImaginationConfig::default(),
         }
     }
 }
@@ -154,7 +158,7 @@ impl TrainConfig {
         if self.total_steps == 0 {
             bail!("total_steps is 0; it must be at least 1");
         }
-        Ok(())
+        self.imagination.validate()
     }
 
     /// Environment steps in an iteration.
@@ -173,7 +177,7 @@ impl TrainConfig {
         (self.learning_rate * (1.0 - done * (1.0 - self.learning_rate_end))) as f32
     }
 
-    /// The part that the update needs.
+    /// The part that the update of the control policy needs. That of the imagination policy differs in discount and epochs.
     pub fn ppo(&self) -> PpoSettings {
         PpoSettings {
             minibatches: self.minibatches,
@@ -217,11 +221,12 @@ pub type Evaluate<'a> = &'a mut dyn FnMut(&Network, u64) -> Vec<(String, f64)>;
 pub struct Trainer {
     config: TrainConfig,
     fingerprint: String,
-    learner: Learner,
+    control: Learner,
+    imagination: Option<Learner>,
     observations: Running,
     privileged: Running,
     slots: Vec<Slot>,
-    lanes: Vec<Lane>,
+    experience: Experience,
     iteration: u64,
 }
 
@@ -249,11 +254,16 @@ impl Trainer {
         for index in 0..config.environments {
             slots.push(Slot::new(checked(make(index)?, index)?, index, config.seed));
         }
+        let learner = |layout, seed, sigma: f64| Learner::new(layout, seed, sigma as f32, config.adam_epsilon as f32);
         Ok(Self {
-            learner: Learner::new(config.method, config.seed, config.sigma as f32, config.adam_epsilon as f32),
+            control: learner(ActorLayout::control(config.method), config.seed, config.sigma),
+            imagination: config.method.imagination().then(|| {
+                let seed = derive_seed(config.seed, Stream::Imagination, 0, 0);
+                learner(ActorLayout::imagination(), seed, config.imagination.sigma)
+            }),
             observations: Running::new(SIZE),
             privileged: Running::new(PRIVILEGED),
-            lanes: vec![Lane::default(); config.environments],
+            experience: Experience::new(config.environments),
             slots,
             iteration: 0,
             config: config.clone(),
@@ -282,45 +292,33 @@ impl Trainer {
         was.checkpoint_seconds = config.checkpoint_seconds;
         was.threads = config.threads;
         if was != *config {
-            let (was, is) = (toml::Table::try_from(&was)?, toml::Table::try_from(config)?);
-            let changed = was.iter().filter(|(key, value)| is.get(*key) != Some(value));
+            let (was, is) = (settings_of(&was)?, settings_of(config)?);
+            let changed = was.iter().filter(|setting| !is.contains(setting));
             let changed: Vec<_> = changed.map(|(key, value)| format!("{key} (it was {value})")).collect();
             bail!("a resumed run keeps its settings, but these were changed: {}", changed.join(", "));
         }
         let mut trainer = Self::new(config, make, fingerprint)?;
         trainer.iteration = checkpoint.iteration;
-        let learner = &mut trainer.learner;
-        let [actor, actor_first, actor_second, critic, critic_first, critic_second] = &checkpoint.parameters;
-        for (to, from) in [
-            (&mut learner.actor, actor),
-            (&mut learner.actor_adam.first, actor_first),
-            (&mut learner.actor_adam.second, actor_second),
-            (&mut learner.critic, critic),
-            (&mut learner.critic_adam.first, critic_first),
-            (&mut learner.critic_adam.second, critic_second),
-        ] {
-            if to.len() != from.len() {
-                bail!(
-                    "the checkpoint has {} parameters where this version of the network has {}",
-                    from.len(),
-                    to.len()
-                );
-            }
-            to.clone_from(from);
+        let learners = || [Some(&trainer.control), trainer.imagination.as_ref()].into_iter().flatten();
+        if checkpoint.learners.len() != learners().count() {
+            bail!(
+                "the checkpoint has {} policies where the method {} has {}",
+                checkpoint.learners.len(),
+                config.method,
+                learners().count()
+            );
         }
-        [learner.actor_adam.steps, learner.critic_adam.steps] = checkpoint.adam_steps;
+        let learners = [Some(&mut trainer.control), trainer.imagination.as_mut()].into_iter().flatten();
+        for (learner, state) in learners.zip(&checkpoint.learners) {
+            restore(learner, state)?;
+        }
         let mut numbers = checkpoint.statistics.iter().copied();
-        let statistics = (|| {
-            Some((
-                Running::from_numbers(SIZE, &mut numbers)?,
-                Running::from_numbers(PRIVILEGED, &mut numbers)?,
-                ValueNorm::from_numbers(&mut numbers)?,
-            ))
-        })();
-        let Some((observations, privileged, value_norm)) = statistics else {
+        let statistics =
+            (|| Some((Running::from_numbers(SIZE, &mut numbers)?, Running::from_numbers(PRIVILEGED, &mut numbers)?)))();
+        let Some((observations, privileged)) = statistics else {
             bail!("the checkpoint has too few statistics: it is of another version");
         };
-        (trainer.observations, trainer.privileged, trainer.learner.value_norm) = (observations, privileged, value_norm);
+        (trainer.observations, trainer.privileged) = (observations, privileged);
         if checkpoint.episodes.len() != config.environments {
             bail!(
                 "the checkpoint has {} environments, the settings say {}",
@@ -338,24 +336,13 @@ impl Trainer {
 
     /// All that [`Trainer::resume`] needs.
     pub fn checkpoint(&self) -> Result<Checkpoint> {
-        let learner = &self.learner;
-        let vectors = [
-            &learner.actor,
-            &learner.actor_adam.first,
-            &learner.actor_adam.second,
-            &learner.critic,
-            &learner.critic_adam.first,
-            &learner.critic_adam.second,
-        ];
-        let numbers = self.observations.numbers().chain(self.privileged.numbers()).chain(learner.value_norm.numbers());
         let episode = |slot: &Slot| Episode { number: slot.episode, actions: slot.actions.clone() };
         Ok(Checkpoint {
             config: toml::to_string(&self.config).context("the settings cannot be written as TOML")?,
             fingerprint: self.fingerprint.clone(),
             iteration: self.iteration,
-            adam_steps: [learner.actor_adam.steps, learner.critic_adam.steps],
-            parameters: vectors.map(Clone::clone),
-            statistics: numbers.collect(),
+            learners: [Some(&self.control), self.imagination.as_ref()].into_iter().flatten().map(state).collect(),
+            statistics: self.observations.numbers().chain(self.privileged.numbers()).collect(),
             episodes: self.slots.iter().map(episode).collect(),
         })
     }
@@ -367,9 +354,18 @@ impl Trainer {
             0 => std::thread::available_parallelism().map_or(1, usize::from),
             threads => threads,
         };
-        let policy = Inference::new(&ActorLayout::new(self.config.method), &self.learner.actor);
+        let policy = Inference::new(&self.control.layout, &self.control.actor);
+        let settings = &self.config.imagination;
+        let imagined_by = self.imagination.as_ref().map(|learner| Inference::new(&learner.layout, &learner.actor));
+        let imagination = self.imagination.as_ref().zip(imagined_by.as_ref()).map(|(learner, policy)| Imagination {
+            policy,
+            seed: learner.seed,
+            bound: settings.bound as f32,
+            follow: settings.follow as f32,
+        });
         let iteration = Iteration {
             policy: &policy,
+            imagination,
             observations: Frozen::new(&self.observations),
             privileged: Frozen::new(&self.privileged),
             run_seed: self.config.seed,
@@ -377,19 +373,18 @@ impl Trainer {
             steps: self.config.rollout_steps,
         };
         let (observations, privileged) = (&mut self.observations, &mut self.privileged);
-        let split = collect(&mut self.slots, &mut self.lanes, iteration, threads, observations, privileged);
+        let split = collect(&mut self.slots, &mut self.experience, iteration, threads, observations, privileged);
         let rollout = began.elapsed();
         let learning_rate = self.config.learning_rate_at(self.iteration);
-        let stats = update(
-            &mut self.learner,
-            self.config.method,
-            &mut self.lanes,
-            &self.config.ppo(),
-            learning_rate,
-            (self.config.seed, self.iteration),
-            threads,
-        );
-        if !self.learner.actor.iter().chain(&self.learner.critic).all(|p| p.is_finite()) {
+        let ppo = self.config.ppo();
+        let Experience { lanes, control, imagination } = &mut self.experience;
+        let stats = update(&mut self.control, lanes, control, &ppo, learning_rate, self.iteration, threads);
+        let imagination_stats = self.imagination.as_mut().map(|learner| {
+            let epochs = settings.epochs;
+            let ppo = PpoSettings { gamma: settings.gamma as f32, epochs, critic_epochs: epochs, ..ppo };
+            update(learner, lanes, imagination, &ppo, learning_rate, self.iteration, threads)
+        });
+        if ![Some(&self.control), self.imagination.as_ref()].into_iter().flatten().all(Learner::is_finite) {
             bail!(
                 "training diverged in iteration {}: a weight is no longer a finite number. The last checkpoint is from before; \
                  a lower learning_rate may help",
@@ -409,39 +404,39 @@ impl Trainer {
             inference: rollout.saturating_sub(physics),
             update: wall.saturating_sub(rollout),
         };
-        let episodes: Vec<_> = self.lanes.iter().flat_map(|lane| &lane.episodes).collect();
+        let Experience { lanes, imagination, .. } = &self.experience;
+        let episodes: Vec<_> = lanes.iter().flat_map(|lane| &lane.episodes).collect();
         let mean = |f: &dyn Fn(&crate::environment::Outcome) -> f64| {
             episodes.iter().map(|outcome| f(outcome)).sum::<f64>() / episodes.len() as f64
         };
-        let rewards: f64 = self.lanes.iter().flat_map(|lane| &lane.rewards).map(|r| f64::from(*r)).sum();
-        let sigma = &self.learner.actor[ActorLayout::new(self.config.method).log_sigma.range()];
-        let scalars = [
-            ("charts/episodic_return", mean(&|o| f64::from(o.episode_return))),
-            ("charts/episodic_length", mean(&|o| f64::from(o.steps))),
-            ("charts/success_rate", mean(&|o| f64::from(u8::from(o.success)))),
-            ("charts/final_distance", mean(&|o| f64::from(o.distance))),
-            ("charts/episodes", episodes.len() as f64),
-            ("charts/step_reward", rewards / self.config.steps_per_iteration() as f64),
-            ("charts/learning_rate", f64::from(learning_rate)),
-            ("charts/sigma", sigma.iter().map(|l| f64::from(l.exp())).sum::<f64>() / sigma.len() as f64),
-            ("losses/policy_loss", stats.policy_loss),
-            ("losses/value_loss", stats.value_loss),
-            ("losses/approx_kl", stats.approx_kl),
-            ("losses/first_minibatch_kl", stats.first_kl),
-            ("losses/clipfrac", stats.clip_fraction),
-            ("losses/entropy", stats.entropy),
-            ("losses/explained_variance", stats.explained_variance),
-            ("losses/actor_grad_norm", stats.actor_grad_norm),
-            ("losses/critic_grad_norm", stats.critic_grad_norm),
-            ("losses/actor_minibatches", stats.actor_minibatches as f64),
+        let steps = self.config.steps_per_iteration() as f64;
+        let rewards: f64 = lanes.iter().flat_map(|lane| &lane.rewards).map(|r| f64::from(*r)).sum();
+        let mut scalars = vec![
+            ("charts/episodic_return".to_string(), mean(&|o| f64::from(o.episode_return))),
+            ("charts/episodic_length".into(), mean(&|o| f64::from(o.steps))),
+            ("charts/success_rate".into(), mean(&|o| f64::from(u8::from(o.success)))),
+            ("charts/final_distance".into(), mean(&|o| f64::from(o.distance))),
+            ("charts/episodes".into(), episodes.len() as f64),
+            ("charts/step_reward".into(), rewards / steps),
+            ("charts/learning_rate".into(), f64::from(learning_rate)),
+            ("charts/sigma".into(), self.control.sigma()),
         ];
-        Ok(Report { times, scalars: scalars.into_iter().map(|(name, value)| (name.into(), value)).collect() })
+        scalars.extend(stats.scalars().map(|(name, value)| (format!("losses/{name}"), value)));
+        if let (Some(learner), Some(stats)) = (&self.imagination, imagination_stats) {
+            let rewards: f64 = imagination.iter().flat_map(|track| &track.rewards).map(|r| f64::from(*r)).sum();
+            let errors: f64 = lanes.iter().flat_map(|lane| &lane.follow_errors).map(|e| f64::from(*e)).sum();
+            scalars.push(("imagination/reward".into(), rewards / steps));
+            scalars.push(("imagination/follow_error".into(), errors / steps));
+            scalars.push(("imagination/sigma".into(), learner.sigma()));
+            scalars.extend(stats.scalars().map(|(name, value)| (format!("imagination/{name}"), value)));
+        }
+        Ok(Report { times, scalars })
     }
 
     /// The policy as it is now.
     pub fn network(&self) -> Network {
-        let layout = ActorLayout::new(self.config.method);
-        layout.network(&self.learner.actor, self.observations.mean(), self.observations.std())
+        let learner = &self.control;
+        learner.layout.network(&learner.actor, self.observations.mean(), self.observations.std())
     }
 
     /// Environment steps taken.
@@ -454,10 +449,53 @@ impl Trainer {
         self.iteration
     }
 
-    /// What is learnt so far.
-    pub fn learner(&self) -> &Learner {
-        &self.learner
+    /// The control policy and its critic as they are now.
+    pub fn control(&self) -> &Learner {
+        &self.control
     }
+
+    /// The imagination policy and its critic, if the method has one.
+    pub fn imagination(&self) -> Option<&Learner> {
+        self.imagination.as_ref()
+    }
+}
+
+/// What a checkpoint keeps of a learner.
+fn state(learner: &Learner) -> LearnerState {
+    let Learner { actor, critic, actor_adam, critic_adam, value_norm, .. } = learner;
+    let vectors = [actor, &actor_adam.first, &actor_adam.second, critic, &critic_adam.first, &critic_adam.second];
+    LearnerState {
+        adam_steps: [actor_adam.steps, critic_adam.steps],
+        parameters: vectors.map(Clone::clone),
+        value_norm: value_norm.numbers(),
+    }
+}
+
+/// Brings a new learner to where one was.
+fn restore(learner: &mut Learner, state: &LearnerState) -> Result<()> {
+    let Learner { actor, critic, actor_adam, critic_adam, value_norm, .. } = learner;
+    let vectors =
+        [actor, &mut actor_adam.first, &mut actor_adam.second, critic, &mut critic_adam.first, &mut critic_adam.second];
+    for (to, from) in vectors.into_iter().zip(&state.parameters) {
+        if to.len() != from.len() {
+            bail!("the checkpoint has {} parameters where this version of the network has {}", from.len(), to.len());
+        }
+        to.clone_from(from);
+    }
+    [actor_adam.steps, critic_adam.steps] = state.adam_steps;
+    *value_norm = ValueNorm::from_numbers(&mut state.value_norm.into_iter()).unwrap_or_default();
+    Ok(())
+}
+
+/// All settings with their values, those of a section after its name and a point.
+fn settings_of(config: &TrainConfig) -> Result<Vec<(String, toml::Value)>> {
+    let settings = toml::Table::try_from(config)?.into_iter().flat_map(|(key, value)| match value {
+        toml::Value::Table(section) => {
+            section.into_iter().map(|(name, value)| (format!("{key}.{name}"), value)).collect()
+        }
+        value => vec![(key, value)],
+    });
+    Ok(settings.collect())
 }
 
 fn checked(environment: Box<dyn Environment>, index: usize) -> Result<Box<dyn Environment>> {
@@ -599,7 +637,8 @@ impl Drop for Signals {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::environment::{Told, Trivial, View};
+    use crate::environment::{Drift, Told, Trivial, View};
+    use crate::methods::imagination::displacement;
 
     fn small(method: Method) -> TrainConfig {
         TrainConfig {
@@ -679,6 +718,13 @@ mod tests {
         let changed = TrainConfig { gamma: 0.5, total_steps: 7, ..config.clone() };
         let error = refused(&changed, "trivial");
         assert!(error.contains("gamma (it was 0.97)") && !error.contains("total_steps"), "{error}");
+        let imagination = ImaginationConfig { follow: 3.0, ..config.imagination.clone() };
+        let error = refused(&TrainConfig { imagination, ..config.clone() }, "trivial");
+        assert!(error.contains("imagination.follow (it was 0.1)") && !error.contains("bound"), "{error}");
+        let mut without = checkpoint.clone();
+        without.learners.clear();
+        let error = Trainer::resume(&without, &config, &teams, "trivial").err().unwrap().to_string();
+        assert!(error.contains("0 policies where the method mappo has 1"), "{error}");
         let longer = TrainConfig { total_steps: 2_000_000, threads: 3, ..config.clone() };
         assert!(Trainer::resume(&checkpoint, &longer, &teams, "trivial").is_ok());
 
@@ -744,25 +790,83 @@ mod tests {
         total / 200.0
     }
 
-    fn learn(method: Method, told: Told) -> Network {
+    fn trained(method: Method, total_steps: u64, make: MakeEnvironment) -> Trainer {
         let config = TrainConfig {
             method,
-            total_steps: 30_000,
+            total_steps,
             environments: 16,
             rollout_steps: 20,
             learning_rate: 1e-3,
             gamma: 0.0,
+            imagination: ImaginationConfig { follow: 1.0, ..Default::default() },
             ..Default::default()
         };
-        let mut trainer = Trainer::new(&config, &|_| Ok(Box::new(Trivial::new(4, told))), "trivial").unwrap();
+        let mut trainer = Trainer::new(&config, make, "trivial").unwrap();
         while trainer.iteration() < config.iterations() {
             trainer.iterate().unwrap();
         }
-        trainer.network()
+        trainer
+    }
+
+    fn learn(method: Method, told: Told) -> Network {
+        trained(method, 30_000, &|_| Ok(Box::new(Trivial::new(4, told)))).network()
     }
 
     #[test]
-    fn both_methods_solve_the_trivial_task() {
+    fn the_imagination_points_at_the_target_and_the_control_policy_follows() {
+        let drift: MakeEnvironment = &|_| Ok(Box::new(Drift::new(3)));
+        let trainer = trained(Method::ComposerNoAttention, 40_000, drift);
+        let network = trainer.network();
+        let learner = trainer.imagination().unwrap();
+        let imagination = Inference::new(&learner.layout, &learner.actor);
+        let bound = trainer.config.imagination.bound as f32;
+        let mut scratch = Default::default();
+        let (mut env, mut view) = (Drift::new(3), View::default());
+        let (mut earned, mut possible, mut distance) = (0.0, 0.0, 0.0);
+        for seed in 0..100 {
+            env.reset(seed);
+            for _ in 0..Drift::STEPS {
+                env.view(&mut view);
+                let normalised: Vec<f32> = view
+                    .observations
+                    .iter()
+                    .flat_map(|o| (0..SIZE).map(|i| ((o[i] - network.mean[i]) / network.std[i]).clamp(-5.0, 5.0)))
+                    .collect();
+                let mut means = [[0.0; 3]; 3];
+                imagination.means(&normalised, &view.heard, &mut means, &mut scratch);
+                let imagined: Vec<_> = (0..3).map(|m| env.place(m, displacement(means[m], bound))).collect();
+                earned += env.imagined_reward(&imagined);
+                let best = view.observations.iter().map(|o| o[0].hypot(o[1]).min(bound)).sum::<f32>() / 3.0;
+                possible += best;
+                let mut actions = [[0.0; 2]; 3];
+                network.act(&view.observations, &view.heard, &mut actions, None);
+                let outcome = env.step(&actions);
+                if outcome.truncated {
+                    distance += outcome.distance / 100.0;
+                }
+            }
+        }
+        // Nearly the shortest way that there is, and the points arrive, although the task itself pays nothing.
+        assert!(earned > 0.9 * possible, "{earned} of {possible}");
+        assert!(distance < 0.3, "{distance}");
+        // Without imagination nobody tells them where to go.
+        let network = trained(Method::Mappo, 10_000, drift).network();
+        let mut apart = 0.0;
+        for seed in 0..100 {
+            env.reset(seed);
+            for _ in 0..Drift::STEPS {
+                env.view(&mut view);
+                let mut actions = [[0.0; 2]; 3];
+                network.act(&view.observations, &view.heard, &mut actions, None);
+                let outcome = env.step(&actions);
+                apart += if outcome.truncated { outcome.distance / 100.0 } else { 0.0 };
+            }
+        }
+        assert!(apart > 1.5, "{apart}");
+    }
+
+    #[test]
+    fn all_methods_solve_the_trivial_task() {
         for method in Method::ALL {
             let network = learn(method, Told::All);
             let reward = reward(&network, 4, Told::All);

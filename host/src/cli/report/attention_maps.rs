@@ -1,0 +1,60 @@
+//! Where the modules attend during one successful episode: the paper's attention figure (section IV-D).
+
+use std::path::Path;
+use std::sync::Arc;
+
+use anyhow::{Result, bail};
+
+use crate::env::SnakeEnv;
+use crate::environment::{Environment, View};
+use crate::eval::{Pilot, episode_seed};
+use crate::files::write_whole;
+use crate::network::Network;
+use crate::plot::{Heatmap, heatmaps};
+use crate::run::RunConfig;
+
+/// Matrices in the figure, evenly over the episode.
+const MAPS: usize = 5;
+/// Episodes that are tried for a successful one.
+const TRIED: u64 = 100;
+
+/// Draws the attention matrices of the first successful episode of a policy; without one there is no figure, and a line says so.
+pub fn write(config: &RunConfig, network: &Network, path: &Path) -> Result<()> {
+    let env = Arc::new(config.evaluation());
+    for index in 0..TRIED {
+        let Some(matrices) = successful(&env, network, episode_seed(super::FINAL_SEED, index))? else { continue };
+        let last = matrices.len() - 1;
+        let maps = (0..MAPS).map(|k| {
+            let step = k * last / (MAPS - 1);
+            Heatmap {
+                title: format!("t = {:.2} s", step as f32 * config.env.control_period),
+                modules: env.robot.modules,
+                weights: matrices[step].clone(),
+            }
+        });
+        let title = format!("{}: attention in a successful episode", config.task.name.title());
+        return Ok(write_whole(path, heatmaps(&maps.collect::<Vec<_>>(), &title).as_bytes())?);
+    }
+    eprintln!("note: {} succeeded in none of {TRIED} episodes, so there is no attention figure", config.task.name);
+    Ok(())
+}
+
+/// The attention matrix of every control step of an episode, if it succeeds.
+fn successful(env: &Arc<crate::env::EnvConfig>, network: &Network, seed: u64) -> Result<Option<Vec<Vec<f32>>>> {
+    let mut env = SnakeEnv::new(env.clone());
+    env.reset_with(seed, &[]);
+    let (mut view, mut actions, mut matrices) = (View::default(), Vec::new(), Vec::new());
+    loop {
+        let mut attention = Vec::new();
+        env.view(&mut view);
+        Pilot::Float(network).act(&view, 0, &mut actions, Some(&mut attention));
+        if attention.is_empty() {
+            bail!("the policy has no attention to draw");
+        }
+        matrices.push(attention);
+        let outcome = env.step(&actions);
+        if outcome.terminated || outcome.truncated {
+            return Ok(outcome.success.then_some(matrices));
+        }
+    }
+}

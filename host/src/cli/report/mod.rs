@@ -1,0 +1,253 @@
+//! `snakectl report`: the published comparisons, from nothing. Killed, it goes on where it was; what is done is skipped.
+
+mod attention_maps;
+
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use anyhow::{Context, Result, bail};
+use composer_shared::policy::Task;
+use serde_json::{Value, json};
+
+use super::policy_file::{CONFIG_FILE, load_config, load_run};
+use super::train::train_in;
+use crate::eval::{Pilot, Trial, healthy};
+use crate::files::{create_folder, write_whole};
+use crate::methods::Method;
+use crate::plot::{Axes, Panel, common_grid, mean_and_se, panels};
+use crate::run::{Knows, RunConfig};
+
+/// Seed of the final evaluations.
+const FINAL_SEED: u64 = 1;
+/// What a run's final evaluation is kept in.
+const RESULT_FILE: &str = "result.json";
+/// Faults of the final evaluations, and the table's headings for them.
+const FAULTS: [(&str, &str); 5] = [
+    ("none", "success"),
+    ("action:1", "one action"),
+    ("action:2", "two action"),
+    ("observation:1", "one observation"),
+    ("unplug:1", "one unplugged"),
+];
+
+/// Arguments of `report`.
+#[derive(clap::Args, Clone, Debug)]
+pub struct Arguments {
+    /// Which comparison
+    #[arg(value_enum)]
+    what: What,
+    /// Folder of the training runs [default: runs/WHAT]
+    #[arg(long, value_name = "DIR")]
+    runs: Option<PathBuf>,
+    /// Folder for the figures, the table and the data [default: host/results/WHAT]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Environment steps of each run
+    #[arg(long, default_value_t = 300_000)]
+    steps: u64,
+    /// Seeds
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=100))]
+    seeds: u64,
+    /// Episodes of the evaluations at the end
+    #[arg(long, default_value_t = 200, value_parser = clap::value_parser!(u64).range(1..=100_000))]
+    episodes: u64,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum What {
+    /// Goal Reaching: mappo against composer-no-imagination, goal known to all modules and to the head alone
+    Attention,
+    /// All five tasks: composer against itself without imagination and without attention (the paper's ablation), and where the
+    /// modules of the complete method attend
+    Ablation,
+}
+
+impl What {
+    fn name(self) -> &'static str {
+        match self {
+            What::Attention => "attention",
+            What::Ablation => "ablation",
+        }
+    }
+
+    /// What the panels of the figure differ in.
+    fn panels_are(self) -> &'static str {
+        match self {
+            What::Attention => "goal known to",
+            What::Ablation => "task",
+        }
+    }
+
+    fn methods(self) -> Vec<Method> {
+        match self {
+            What::Attention => vec![Method::Mappo, Method::ComposerNoImagination],
+            What::Ablation => vec![Method::Composer, Method::ComposerNoImagination, Method::ComposerNoAttention],
+        }
+    }
+
+    /// Name in folders, words in tables, and the settings of each panel.
+    fn panels(self) -> Vec<(&'static str, &'static str, RunConfig)> {
+        match self {
+            What::Attention => [("all", "all modules", Knows::All), ("head", "the head alone", Knows::Head)]
+                .map(|(name, words, knows)| {
+                    let mut config = RunConfig::default();
+                    config.env.goal_known_to = knows;
+                    (name, words, config)
+                })
+                .to_vec(),
+            What::Ablation => Task::ALL
+                .map(|task| {
+                    let mut config = RunConfig::default();
+                    config.task.name = task;
+                    (task.name(), task.title(), config)
+                })
+                .to_vec(),
+        }
+    }
+}
+
+/// One training run of a comparison.
+struct Run {
+    folder: PathBuf,
+    config: RunConfig,
+    panel: usize,
+}
+
+/// Runs the verb.
+pub fn run(arguments: &Arguments) -> Result<()> {
+    let what = arguments.what;
+    let folder = arguments.runs.clone().unwrap_or_else(|| Path::new("runs").join(what.name()));
+    let out = arguments.out.clone().unwrap_or_else(|| Path::new("host/results").join(what.name()));
+    create_folder(&out)?;
+    let mut runs = Vec::new();
+    for seed in 1..=arguments.seeds {
+        for (panel, (name, _, config)) in what.panels().into_iter().enumerate() {
+            for method in what.methods() {
+                let mut config = config.clone();
+                config.train.method = method;
+                config.train.seed = seed;
+                config.train.total_steps = arguments.steps;
+                config.train.evaluate_every = (arguments.steps / 10).max(1);
+                runs.push(Run { folder: folder.join(format!("{method}-{name}-{seed}")), config, panel });
+            }
+        }
+    }
+    for (number, run) in runs.iter().enumerate() {
+        eprintln!("run {} of {}: {}", number + 1, runs.len(), run.folder.display());
+        if !finish(run, arguments.episodes)? {
+            bail!("stopped; the same command goes on from here");
+        }
+    }
+    publish(what, &runs, arguments, &out)?;
+    if what == What::Ablation {
+        for task in [Task::GoalReaching, Task::WallClimbing, Task::TubeCrossing] {
+            let complete = |run: &&Run| run.config.task.name == task && run.config.train.method == Method::Composer;
+            let Some(run) = runs.iter().find(complete) else { continue };
+            let (config, network) = load_run(&run.folder)?;
+            let path = out.join(format!("attention-{task}.svg"));
+            attention_maps::write(&config, &network, &path)?;
+        }
+    }
+    println!("\nmean and standard error over {} seeds; written to {}", arguments.seeds, out.display());
+    Ok(())
+}
+
+/// Trains and evaluates a run unless that is done. False: interrupted.
+fn finish(run: &Run, episodes: u64) -> Result<bool> {
+    let result = run.folder.join(RESULT_FILE);
+    let begun = run.folder.join(CONFIG_FILE).exists();
+    if begun && load_config(&run.folder.join(CONFIG_FILE))? != run.config {
+        bail!("{} holds a run with other settings; choose another --runs folder", run.folder.display());
+    }
+    if result.exists() {
+        return Ok(true);
+    }
+    if train_in(&run.config, &run.folder, begun)?.interrupted {
+        return Ok(false);
+    }
+    let (config, network) = load_run(&run.folder)?;
+    let env = Arc::new(config.evaluation());
+    let trial = Trial {
+        config: &env,
+        episodes: episodes as usize,
+        seed: FINAL_SEED,
+        faults: &healthy,
+        threads: super::cores(),
+    };
+    let mut results = serde_json::Map::new();
+    for (fault, _) in FAULTS {
+        let plan: composer_sim_bridge::faults::FaultPlan =
+            fault.parse().with_context(|| format!("the fault {fault}"))?;
+        let draw = |seed, modules| plan.draw(seed, modules);
+        let report = Trial { faults: &draw, ..trial }.evaluate(Pilot::Float(&network), fault, &|| {});
+        results.insert(fault.into(), serde_json::to_value(report)?);
+    }
+    write_whole(&result, serde_json::to_string_pretty(&results)?.as_bytes())?;
+    Ok(true)
+}
+
+/// Success at each evaluation of a run: (environment steps, share).
+fn curve(folder: &Path) -> Result<Vec<(f64, f64)>> {
+    let path = folder.join("metrics.jsonl");
+    let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
+    let mut points = vec![(0.0, 0.0)];
+    for line in text.lines() {
+        let line: Value = serde_json::from_str(line).with_context(|| format!("{} is damaged", path.display()))?;
+        if let (Some(x), Some(y)) = (line["global_step"].as_f64(), line["evaluation/success_rate"].as_f64()) {
+            points.push((x, y));
+        }
+    }
+    Ok(points)
+}
+
+/// Figure, table and data.
+fn publish(what: What, runs: &[Run], arguments: &Arguments, out: &Path) -> Result<()> {
+    let mut figure = Vec::new();
+    let mut data = Vec::new();
+    let headings = FAULTS.map(|(_, heading)| heading).join(" | ");
+    let mut table = format!("| {} | method | {headings} | steps |\n|{}\n", what.panels_are(), "---|".repeat(8));
+    for (panel, (_, words, _)) in what.panels().into_iter().enumerate() {
+        let mut series = Vec::new();
+        for (colour, method) in what.methods().into_iter().enumerate() {
+            let of: Vec<&Run> = runs.iter().filter(|r| r.panel == panel && r.config.train.method == method).collect();
+            let curves = of.iter().map(|r| curve(&r.folder)).collect::<Result<Vec<_>>>()?;
+            let mut mean = mean_and_se(&curves, &common_grid(&curves, 11));
+            mean.name = method.name().into();
+            mean.colour = colour;
+            series.push(mean);
+            let mut results = Vec::new();
+            for (run, curve) in of.iter().zip(&curves) {
+                let text = std::fs::read(run.folder.join(RESULT_FILE))?;
+                let result: Value = serde_json::from_slice(&text)?;
+                data.push(json!({
+                    "method": method.name(), what.panels_are(): words, "seed": run.config.train.seed,
+                    "environment_steps": arguments.steps, "curve": curve, "final": result,
+                }));
+                results.push(result);
+            }
+            let column = |fault: &str, key: &str, digits: usize| {
+                let values: Vec<f64> = results.iter().filter_map(|r| r[fault][key].as_f64()).collect();
+                let n = values.len() as f64;
+                let mean = values.iter().sum::<f64>() / n;
+                let variance = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
+                format!("{mean:.digits$} +- {:.digits$}", (variance / n).sqrt())
+            };
+            let success = FAULTS.map(|(fault, _)| column(fault, "success_rate", 2)).join(" | ");
+            writeln!(table, "| {words} | {method} | {success} | {} |", column("none", "steps_mean", 1))?;
+        }
+        let axes = Axes {
+            title: if what == What::Attention { format!("Goal known to {words}") } else { words.into() },
+            x_label: "environment steps".into(),
+            y_label: "success rate".into(),
+            x_range: None,
+            y_range: Some((0.0, 1.0)),
+        };
+        figure.push(Panel { axes, series });
+    }
+    write_whole(&out.join("learning-curves.svg"), panels(&figure).as_bytes())?;
+    write_whole(&out.join("runs.json"), serde_json::to_string_pretty(&data)?.as_bytes())?;
+    write_whole(&out.join("table.md"), table.as_bytes())?;
+    print!("{table}");
+    Ok(())
+}
