@@ -147,7 +147,7 @@ mod tests {
     #[test]
     fn block_and_goal_lie_where_they_should_and_clear_of_the_snake() {
         let robot = Robot::default();
-        let near = BlockPushing { block_distance: [1.72, 2.0], block_bearing: 90.0, ..BlockPushing::default() };
+        let near = BlockPushing { block_distance: [2.07, 2.3], block_bearing: 90.0, ..BlockPushing::default() };
         for task in [BlockPushing::default(), near] {
             task.validate(&robot).unwrap();
             for seed in 0..300 {
@@ -173,7 +173,7 @@ mod tests {
     fn the_place_to_push_from_lies_behind_the_block() {
         let task = BlockPushing::default();
         let place = task.push_from([5.0, 0.0, 0.5], [9.0, 0.0, 0.5], 0.4);
-        assert!((place[0] - (5.0 - 0.75 - 0.4)).abs() < 1e-5 && place[1] == 0.0, "{place:?}");
+        assert!((place[0] - (5.0 - 1.0 - 0.4)).abs() < 1e-5 && place[1] == 0.0, "{place:?}");
         // A block at its goal has no side from which to push; the place stays finite.
         assert!(task.push_from([5.0, 0.0, 0.5], [5.0, 0.0, 0.5], 0.4).iter().all(|v| v.is_finite()));
     }
@@ -185,7 +185,7 @@ mod tests {
             (BlockPushing { block_size: [0.0, 1.0, 1.0], ..default() }, "an edge of block_size = 0"),
             (BlockPushing { block_mass: 0.0, ..default() }, "block_mass = 0"),
             (BlockPushing { block_friction: -0.1, ..default() }, "block_friction = -0.1"),
-            (BlockPushing { block_distance: [1.0, 4.0], ..default() }, "the block would stand on the snake"),
+            (BlockPushing { block_distance: [2.0, 4.0], ..default() }, "the block would stand on the snake"),
             (BlockPushing { goal_distance: [0.5, 4.0], ..default() }, "the block would be at its goal from the start"),
             (BlockPushing { goal_distance: [4.0, 400.0], ..default() }, "goal_distance = [4, 400]"),
             (BlockPushing { goal_bearing: 200.0, ..default() }, "goal_bearing = 200"),

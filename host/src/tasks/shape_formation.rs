@@ -86,10 +86,10 @@ impl Shape {
     /// The tightest curvature, as a multiple of the mean.
     fn tightest(self) -> f32 {
         match self {
-            Kind::Line | Kind::Arc | Kind::C | Kind::Ring => 1.0,
-            Kind::S => 2.0,
-            Kind::U => 3.0,
-            Kind::Spiral => 1.65,
+            Shape::Line | Shape::Arc | Shape::C | Shape::Ring => 1.0,
+            Shape::S => 2.0,
+            Shape::U => 3.0,
+            Shape::Spiral => 1.65,
         }
     }
 
@@ -226,7 +226,7 @@ mod tests {
         for modules in (3..=16).chain([24, 32, 48, 64]) {
             let robot = Robot { modules, ..Robot::default() };
             let spacing = robot.links_per_module as f32 * robot.link_length;
-            for kind in Kind::ALL {
+            for kind in Shape::ALL {
                 for seed in 0..20 {
                     let draw =
                         || ShapeFormation::targets(kind, &mut ChaCha8Rng::seed_from_u64(seed), &robot, 3.0, 45.0);
@@ -252,7 +252,7 @@ mod tests {
 
     #[test]
     fn the_curve_is_as_long_as_the_snake() {
-        for kind in Kind::ALL {
+        for kind in Shape::ALL {
             for bend in kind.bend().map(f32::to_radians) {
                 // Points so dense that chord and curve are the same.
                 let points = curve(kind, bend, 64, 0.1);

@@ -232,7 +232,7 @@ fn episodes(task: Task, count: u64) -> Worst {
     let (mut task, robot) = (TaskConfig::new(task), Robot::default());
     // Nearer than the tasks have it, so that more of the episodes touch something.
     task.rules.wall_climbing.wall_distance = [0.7, 2.0];
-    task.rules.block_pushing.block_distance = [1.8, 3.0];
+    task.rules.block_pushing.block_distance = [2.1, 3.3];
     task.rules.block_pushing.block_bearing = 60.0;
     task.rules.tube_crossing.entrance_distance = [0.7, 1.5];
     task.rules.tube_crossing.tube_bend = 90.0;
