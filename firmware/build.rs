@@ -1,10 +1,12 @@
-//! Gives the image of a board its memory layout (`boards/BOARD.x`) and linker scripts.
+//! Gives the image of a board its memory layout (`boards/BOARD.x`) and linker scripts, and the controller the fingerprint of its sources.
 
-use std::path::PathBuf;
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::path::{Path, PathBuf};
 use std::{env, fs};
 
 fn main() {
     println!("cargo::rerun-if-changed=boards");
+    fingerprint();
     let boards = ["qemu", "stm32g474"];
     let chosen = boards
         .into_iter()
@@ -20,4 +22,34 @@ fn main() {
     println!("cargo::rustc-link-search={}", out.display());
     println!("cargo::rustc-link-arg-bins=--nmagic");
     println!("cargo::rustc-link-arg-bins=-Tlink.x");
+}
+
+/// What the libraries of the controller are built from, boards apart, as one number: a simulator and an image that differ in it
+/// run different controllers (`link::BUILD`).
+fn fingerprint() {
+    let mut files = Vec::new();
+    for folder in ["src", "../shared/src"] {
+        println!("cargo::rerun-if-changed={folder}");
+        sources(Path::new(folder), &mut files);
+    }
+    files.sort();
+    let mut hasher = DefaultHasher::new();
+    for file in &files {
+        file.hash(&mut hasher);
+        fs::read(file).expect("the sources can be read").hash(&mut hasher);
+    }
+    println!("cargo::rustc-env=COMPOSER_CONTROLLER_SOURCES={:016x}", hasher.finish());
+}
+
+fn sources(folder: &Path, files: &mut Vec<PathBuf>) {
+    for entry in fs::read_dir(folder).expect("the sources can be listed") {
+        let path = entry.expect("the sources can be listed").path();
+        if path.is_dir() {
+            if !path.ends_with("src/bin") {
+                sources(&path, files);
+            }
+        } else if path.extension().is_some_and(|extension| extension == "rs") && !path.ends_with("tests.rs") {
+            files.push(path);
+        }
+    }
 }

@@ -47,6 +47,7 @@ use composer_shared::wire::{
     STATION, State, StopCommand, Sync, Telemetry, quantise_angle,
 };
 use nalgebra::Vector3;
+use serde::{Deserialize, Serialize};
 
 use crate::failsafe::Failsafe;
 pub use crate::failsafe::{BusOffPolicy, BusStatus, Fault, FaultSet, LimitedBy};
@@ -65,7 +66,7 @@ pub const REPORT_EVERY: u16 = 10;
 const CLAIM_AFTER: u8 = 3;
 
 /// Kind of bus.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum BusKind {
     /// CAN 2.0 with 8-byte frames: a latent travels in eight pieces.
     Classic,
@@ -74,7 +75,7 @@ pub enum BusKind {
 }
 
 /// When things happen within and over control cycles.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Timing {
     /// Control period.
     pub period_us: u32,
@@ -133,7 +134,7 @@ impl Timing {
 }
 
 /// What makes one module different from the next.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Config {
     /// This module's number: 0 is the head.
     pub node: u8,
@@ -154,7 +155,8 @@ impl Config {
         Config { node, modules, bus, bus_off: BusOffPolicy::Recover, timing }
     }
 
-    fn check(&self) -> Result<(), ConfigError> {
+    /// Whether a controller accepts it; if not, why.
+    pub fn check(&self) -> Result<(), ConfigError> {
         if self.modules == 0 || usize::from(self.modules) > MAX_MODULES {
             return Err(ConfigError::Modules(self.modules));
         }
@@ -252,7 +254,7 @@ pub struct Outputs {
 }
 
 /// Counters since power-up; they saturate.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Stats {
     /// Control cycles started.
     pub cycles: u32,

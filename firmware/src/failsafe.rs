@@ -19,6 +19,7 @@
 use composer_shared::observation::Sensors;
 use composer_shared::robot::{AXES, Limits};
 pub use composer_shared::wire::{Fault, LimitedBy};
+use serde::{Deserialize, Serialize};
 
 use crate::controller::Micros;
 
@@ -26,7 +27,7 @@ use crate::controller::Micros;
 const COOL_DOWN: f32 = 5.0;
 
 /// A set of faults.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FaultSet(u16);
 
 impl FaultSet {
@@ -77,7 +78,7 @@ const fn bit(fault: Fault) -> u16 {
 }
 
 /// How the CAN controller is (ISO 11898-1 fault confinement).
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum BusStatus {
     /// Few errors.
     #[default]
@@ -89,7 +90,7 @@ pub enum BusStatus {
 }
 
 /// What happens after bus-off.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum BusOffPolicy {
     /// The CAN port recovers (128 times 11 recessive bits) and the module goes on. Until then it acts as an isolated one.
     #[default]

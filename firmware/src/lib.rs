@@ -7,11 +7,12 @@
 //! bounded amount of work per call, whatever the bus delivers.
 //!
 //! [`neighbours`] keeps what was heard from the other modules and how fresh it is; [`failsafe`] decides when the motors relax
-//! and why.
+//! and why. [`link`] is how an emulated module talks to the simulator.
 
 #[cfg(test)]
 extern crate std;
 
 pub mod controller;
 pub mod failsafe;
+pub mod link;
 pub mod neighbours;

@@ -17,13 +17,28 @@ pub struct SnakePlant {
     snake: Snake,
     judge: Judge,
     physics_steps: usize,
+    /// What the motors get now, by its bits.
+    torques: Vec<[u32; AXES]>,
+    /// The same of every physics step so far, module by module, if it is kept.
+    trace: Option<Vec<[u32; AXES]>>,
 }
 
 impl SnakePlant {
     /// The start of the episode with this seed, the same as [`crate::env::SnakeEnv`]'s.
     pub fn new(config: Arc<EnvConfig>, seed: u64) -> Self {
         let (snake, judge) = Judge::start(&config.task, seed, &config.robot);
-        SnakePlant { config, snake, judge, physics_steps: 0 }
+        let torques = vec![[0; AXES]; config.robot.modules];
+        SnakePlant { config, snake, judge, physics_steps: 0, torques, trace: None }
+    }
+
+    /// The same, keeping the torques of every physics step.
+    pub fn traced(config: Arc<EnvConfig>, seed: u64) -> Self {
+        SnakePlant { trace: Some(Vec::new()), ..SnakePlant::new(config, seed) }
+    }
+
+    /// The torques (yaw and pitch, by their bits) of all physics steps so far, in each module by module; empty if they are not kept.
+    pub fn trace(&self) -> &[[u32; AXES]] {
+        self.trace.as_deref().unwrap_or_default()
     }
 
     /// The snake.
@@ -60,10 +75,14 @@ impl Plant for SnakePlant {
     }
 
     fn set_torque(&mut self, module: usize, torque: [f32; AXES]) {
+        self.torques[module] = torque.map(f32::to_bits);
         self.snake.set_torque(module, torque);
     }
 
     fn step(&mut self) {
+        if let Some(trace) = &mut self.trace {
+            trace.extend_from_slice(&self.torques);
+        }
         self.snake.step();
         self.judge.watch(&self.config.task, &self.snake);
         self.physics_steps += 1;

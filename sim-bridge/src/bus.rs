@@ -448,6 +448,11 @@ impl Bus {
         slot.attached && self.off & bit(node) == 0 && slot.mailboxes.len() < MAILBOXES
     }
 
+    /// How many more frames `node` can take.
+    pub fn room(&self, node: usize) -> usize {
+        if self.has_room(node) { MAILBOXES - self.nodes[node].mailboxes.len() } else { 0 }
+    }
+
     /// Puts a frame in a mailbox of `node`, to be sent from `ready_ns` on. Gives the frame back if there is no room.
     pub fn send(&mut self, node: usize, frame: &Frame, ready_ns: u64) -> Result<(), Frame> {
         if !self.has_room(node) {

@@ -1,15 +1,19 @@
-#![forbid(unsafe_code)]
+#![deny(unsafe_code)]
 //! A simulated CAN bus in virtual time with the modules of a snake robot as its nodes.
 //!
 //! [`bus`] is the bus, with [`frame_bits`] for the length of frames and [`faults`] for what goes wrong; [`candump`] writes and
 //! reads its logs. [`sil`] puts complete firmware controllers and the ground station ([`station`]) on it and lets them control
-//! anything that implements [`Plant`]. Nothing here depends on wall-clock time: the same seed gives the same run, bit for bit.
+//! anything that implements [`Plant`]. A module's controller runs in this process or elsewhere ([`computer`], [`remote`]), above all in an
+//! emulated microcontroller ([`qemu`]). Nothing here depends on wall-clock time: the same seed gives the same run, bit for bit.
 
 pub mod bus;
 pub mod candump;
+pub mod computer;
 pub mod faults;
 pub mod frame_bits;
 pub mod plant;
+pub mod qemu;
+pub mod remote;
 pub mod sil;
 pub mod station;
 

@@ -1,6 +1,7 @@
 //! Software in the loop: complete module controllers on the simulated bus, controlling a [`Plant`].
 //!
-//! One discrete-event loop in virtual time (ns) joins the plant, which advances in its own steps, one firmware controller a module,
+//! One discrete-event loop in virtual time (ns) joins the plant, which advances in its own steps, one firmware controller a module
+//! ([`run`]: in this process; [`run_on`]: on any [computer](crate::computer)),
 //! the ground station and the [`Bus`] between them. At time 0 the first SYNC is sent: the controllers were switched on so much earlier that the
 //! head takes the time over just then. So control cycle c covers the same time as control step c of an environment without a bus.
 //!
@@ -9,6 +10,7 @@
 //! - Computing takes time: [`SilConfig::encode_latency_us`] from the last STATE needed until LATENT is ready to be sent,
 //!   [`SilConfig::act_latency_us`] from the last LATENT needed until the torque is at the motor.
 //! - An unplugged module is gone: no controller, no torque from the next plant step on. Plugged in again, a fresh controller starts.
+//!   A module whose computer somebody else takes away is unplugged too, until a fault unplugs it and it is plugged in again.
 //! - With a dead actuator the plant gets no torque, whatever the controller says; with a zeroed sensor the controller reads
 //!   [`Sensors::ZERO`], with a stuck one always the same sample.
 //!
@@ -20,7 +22,7 @@ use std::collections::VecDeque;
 use std::io::{self, Write};
 
 use composer_firmware::controller::{
-    BusKind, BusOffPolicy, BusStatus, Config, ConfigError, Controller, FaultSet, Micros, Stats, Timing,
+    BusKind, BusOffPolicy, BusStatus, Config, ConfigError, FaultSet, Micros, Stats, Timing,
 };
 use composer_shared::observation::Sensors;
 use composer_shared::policy::{Policy, PolicyError};
@@ -29,6 +31,7 @@ use composer_shared::wire::{Frame, Function, Mode, StopCommand};
 
 use crate::bus::{self, Bus, BusConfig, Disturbance, ErrorState, Event};
 use crate::candump;
+use crate::computer::{Computer, InProcess, Launcher, Poll, Trouble};
 use crate::faults::{Fault, ScheduledFault};
 use crate::frame_bits::BitRates;
 use crate::plant::Plant;
@@ -175,6 +178,14 @@ pub enum SilError {
     /// The plant's step is zero.
     #[error("the plant's step is 0 ns, but must be at least 1")]
     Step,
+    /// The computer of a module failed.
+    #[error("module {module}: {error}")]
+    Computer {
+        /// Which module.
+        module: usize,
+        /// Why.
+        error: Trouble,
+    },
     /// The capture cannot be written.
     #[error("the capture cannot be written: {0}")]
     Capture(#[from] io::Error),
@@ -232,6 +243,17 @@ pub struct ModuleReport {
     pub longest_gap_ms: f64,
 }
 
+/// A module that was lost though no fault of the plan took it: somebody else ended its computer.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Lost {
+    /// Which module.
+    pub module: usize,
+    /// When it was noticed, ns.
+    pub at_ns: u64,
+    /// What happened.
+    pub how: String,
+}
+
 /// What a run was like.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SilReport {
@@ -255,6 +277,8 @@ pub struct SilReport {
     pub frame_latency_max_ms: f64,
     /// The faults that occurred.
     pub faults: Vec<ScheduledFault>,
+    /// Modules that somebody else took away; never any in the own process.
+    pub lost: Vec<Lost>,
     /// Whether the run ended by [`SilConfig::limit_ns`] instead of the plant being done.
     pub cut_short: bool,
     /// The modules, head first.
@@ -269,8 +293,10 @@ enum SensorState {
     Stuck(Sensors),
 }
 
-struct Module<'a> {
-    controller: Option<Controller<'a>>,
+struct Module<C> {
+    controller: Option<C>,
+    /// Somebody else took the controller away: it does not come back by itself.
+    lost: bool,
     clock: Clock,
     next_poll_ns: u64,
     /// What the controller answered last.
@@ -310,15 +336,17 @@ fn add(past: &Stats, now: &Stats) -> Stats {
     }
 }
 
-struct Engine<'a, 'c> {
+struct Engine<'c, L: Launcher> {
     config: &'c SilConfig,
-    policy: Policy<'a>,
+    policy: Policy<'c>,
+    launcher: &'c L,
     bus: Bus,
     station: Station,
     /// GOAL frames of this cycle that wait for a mailbox.
     telling: VecDeque<Frame>,
     station_node: usize,
-    modules: Vec<Module<'a>>,
+    modules: Vec<Module<L::Computer>>,
+    lost: Vec<Lost>,
     /// What starts (`true`) and ends, in order of time; `next_change` is the first that has not.
     changes: Vec<(u64, bool, Fault)>,
     next_change: usize,
@@ -329,7 +357,7 @@ struct Engine<'a, 'c> {
     next_poll_ns: u64,
 }
 
-/// Runs an episode: from now until the plant is done.
+/// Runs an episode with the controllers in this process: from now until the plant is done.
 ///
 /// `image` is the policy image of all modules. `capture` gets a candump log: interface `can0` is the piece of cable at the head end, `can1` the
 /// next one after a cut, and so on. `observer` is called at the end of each control cycle, and at the end of the run.
@@ -337,10 +365,22 @@ pub fn run<P: Plant + ?Sized>(
     plant: &mut P,
     image: &[u8],
     config: &SilConfig,
-    mut capture: Option<&mut dyn Write>,
+    capture: Option<&mut dyn Write>,
     observer: &mut dyn FnMut(&CycleView<'_>, &P),
 ) -> Result<SilReport, SilError> {
     let policy = Policy::parse(image).map_err(SilError::Policy)?;
+    run_on(&InProcess::new(policy), plant, policy, config, capture, observer)
+}
+
+/// The same with controllers that `launcher` starts, all with this policy.
+pub fn run_on<P: Plant + ?Sized, L: Launcher>(
+    launcher: &L,
+    plant: &mut P,
+    policy: Policy<'_>,
+    config: &SilConfig,
+    mut capture: Option<&mut dyn Write>,
+    observer: &mut dyn FnMut(&CycleView<'_>, &P),
+) -> Result<SilReport, SilError> {
     let count = plant.modules();
     if count == 0 || count > MAX_MODULES {
         return Err(SilError::Modules(count));
@@ -353,20 +393,20 @@ pub fn run<P: Plant + ?Sized>(
     if step_ns == 0 {
         return Err(SilError::Step);
     }
-    let mut engine = Engine::new(config, policy, count)?;
+    let mut engine = Engine::new(config, launcher, policy, count)?;
     let period_ns = u64::from(engine.timing().period_us) * 1000;
     let (mut next_step, mut next_view, mut cycle) = (step_ns, period_ns, 0);
     let mut now = 0;
     while !plant.done() && now < config.limit_ns {
         let next = engine.next_ns().min(next_step);
         now = next.min(config.limit_ns);
-        engine.change_faults(plant, now);
+        engine.change_faults(plant, now)?;
         if next_step <= now {
             plant.step();
             engine.apply_torques(plant, now);
             next_step += step_ns;
             if now >= next_view || plant.done() {
-                engine.view(cycle, now, plant, observer);
+                engine.view(cycle, now, plant, observer)?;
                 cycle += 1;
                 next_view += period_ns;
                 if plant.done() {
@@ -378,13 +418,13 @@ pub fn run<P: Plant + ?Sized>(
         while let Some(event) = engine.bus.poll(now) {
             engine.handle(plant, &event, &mut capture)?;
         }
-        engine.poll_due(plant, now);
+        engine.poll_due(plant, now)?;
     }
-    Ok(engine.report(now, !plant.done()))
+    engine.report(now, !plant.done())
 }
 
-impl<'a, 'c> Engine<'a, 'c> {
-    fn new(config: &'c SilConfig, policy: Policy<'a>, count: usize) -> Result<Self, SilError> {
+impl<'c, L: Launcher> Engine<'c, L> {
+    fn new(config: &'c SilConfig, launcher: &'c L, policy: Policy<'c>, count: usize) -> Result<Self, SilError> {
         let nodes = count + 1 + usize::from(!config.injected.is_empty());
         let bus_config = BusConfig { rates: config.rates, automatic_recovery: config.bus_off == BusOffPolicy::Recover };
         let mut changes = Vec::new();
@@ -396,11 +436,13 @@ impl<'a, 'c> Engine<'a, 'c> {
         let mut engine = Engine {
             config,
             policy,
+            launcher,
             bus: Bus::new(bus_config, nodes, config.seed),
             station: Station::new(config.bus == BusKind::Fd, policy.task().points(count as u8)),
             telling: VecDeque::new(),
             station_node: config.station_behind.min(count),
             modules: Vec::with_capacity(count),
+            lost: Vec::new(),
             changes,
             next_change: 0,
             active: Vec::new(),
@@ -411,6 +453,7 @@ impl<'a, 'c> Engine<'a, 'c> {
         for module in 0..count {
             engine.modules.push(Module {
                 controller: None,
+                lost: false,
                 clock: config.clock(module),
                 next_poll_ns: 0,
                 commanded: [0.0; AXES],
@@ -432,12 +475,25 @@ impl<'a, 'c> Engine<'a, 'c> {
         let timing = engine.timing();
         let wait =
             u64::from(timing.takeover_periods) * u64::from(timing.period_us) + u64::from(timing.takeover_stagger_us);
-        for (module, state) in engine.modules.iter_mut().enumerate() {
-            let started = state.clock.offset_us;
-            state.clock.offset_us += wait;
-            state.controller = Some(start(config, policy, module, count, started)?);
+        for module in 0..count {
+            let started = engine.modules[module].clock.offset_us;
+            engine.modules[module].clock.offset_us += wait;
+            let controller = engine.start(module, started)?;
+            engine.modules[module].controller = Some(controller);
         }
         Ok(engine)
+    }
+
+    fn start(&self, module: usize, now: Micros) -> Result<L::Computer, SilError> {
+        let config = self.config;
+        let node = config.numbers.get(module).copied().unwrap_or(module as u8);
+        let mut setup = Config::new(node, self.modules.len() as u8, config.bus, &self.policy);
+        setup.bus_off = config.bus_off;
+        setup.timing = config.timing.unwrap_or(setup.timing);
+        self.launcher.start(setup, now).map_err(|trouble| match trouble {
+            Trouble::Config(error) => SilError::Config(error),
+            error => SilError::Computer { module, error },
+        })
     }
 
     fn timing(&self) -> Timing {
@@ -469,7 +525,7 @@ impl<'a, 'c> Engine<'a, 'c> {
     }
 
     /// Starts and ends faults.
-    fn change_faults<P: Plant + ?Sized>(&mut self, plant: &P, now: u64) {
+    fn change_faults<P: Plant + ?Sized>(&mut self, plant: &P, now: u64) -> Result<(), SilError> {
         let mut changed = false;
         while let Some(&(at, starts, fault)) = self.changes.get(self.next_change)
             && at <= now
@@ -483,7 +539,7 @@ impl<'a, 'c> Engine<'a, 'c> {
             }
         }
         if !changed {
-            return;
+            return Ok(());
         }
         let either = |p: f64, q: f64| 1.0 - (1.0 - p) * (1.0 - q);
         let mut disturbance = Disturbance::default();
@@ -504,11 +560,12 @@ impl<'a, 'c> Engine<'a, 'c> {
             self.bus.set_cut(now, node, cuts >> module & 1 == 1);
         }
         for module in 0..self.modules.len() {
-            self.set_module_faults(plant, module, now);
+            self.set_module_faults(plant, module, now)?;
         }
+        Ok(())
     }
 
-    fn set_module_faults<P: Plant + ?Sized>(&mut self, plant: &P, module: usize, now: u64) {
+    fn set_module_faults<P: Plant + ?Sized>(&mut self, plant: &P, module: usize, now: u64) -> Result<(), SilError> {
         let node = self.node(module);
         let mine = |fault: &&Fault| fault.module() == Some(module);
         let has = |wanted: Fault| self.active.contains(&wanted);
@@ -537,10 +594,12 @@ impl<'a, 'c> Engine<'a, 'c> {
             state.misread = misread;
             self.bus.set_misread(node, misread);
         }
+        state.lost &= !unplugged;
         if unplugged && state.controller.is_some() {
+            self.retire(module)?;
             self.unplug(module, now);
-        } else if !unplugged && state.controller.is_none() {
-            self.plug(module, now);
+        } else if !unplugged && state.controller.is_none() && !state.lost {
+            self.plug(module, now)?;
         }
         let state = &mut self.modules[module];
         if state.babble != babble {
@@ -548,6 +607,27 @@ impl<'a, 'c> Engine<'a, 'c> {
             let frame = babble.and_then(|id| Frame::new(id, self.config.bus == BusKind::Fd, &[0x55; 8]));
             self.bus.set_babble(now, node, frame);
         }
+        Ok(())
+    }
+
+    /// Asks for the last time what a module counted, before it is unplugged or the run ends.
+    fn retire(&mut self, module: usize) -> Result<(), SilError> {
+        let Some(controller) = &mut self.modules[module].controller else { return Ok(()) };
+        let asked = controller.ask_status().and_then(|()| controller.await_status());
+        match asked {
+            // Too late to matter.
+            Ok(()) | Err(Trouble::Gone(_)) => Ok(()),
+            Err(error) => Err(SilError::Computer { module, error }),
+        }
+    }
+
+    /// Goes on without a module that somebody else took away; any other trouble ends the run.
+    fn lose(&mut self, module: usize, now: u64, trouble: Trouble) -> Result<(), SilError> {
+        let Trouble::Gone(how) = trouble else { return Err(SilError::Computer { module, error: trouble }) };
+        self.lost.push(Lost { module, at_ns: now, how });
+        self.modules[module].lost = true;
+        self.unplug(module, now);
+        Ok(())
     }
 
     fn unplug(&mut self, module: usize, now: u64) {
@@ -555,7 +635,7 @@ impl<'a, 'c> Engine<'a, 'c> {
         self.bus.unplug(now, node);
         let state = &mut self.modules[module];
         if let Some(controller) = state.controller.take() {
-            state.past = add(&state.past, controller.stats());
+            state.past = add(&state.past, &controller.status().stats);
         }
         state.longest_gap_ns = state.longest_gap_ns.max(now.saturating_sub(state.acted_ns));
         state.next_poll_ns = NEVER;
@@ -565,18 +645,17 @@ impl<'a, 'c> Engine<'a, 'c> {
         state.babble = None;
     }
 
-    fn plug(&mut self, module: usize, now: u64) {
+    fn plug(&mut self, module: usize, now: u64) -> Result<(), SilError> {
         let node = self.node(module);
-        let count = self.modules.len();
+        let controller = self.start(module, self.modules[module].clock.show(now))?;
         let state = &mut self.modules[module];
-        let local = state.clock.show(now);
-        // The same configuration was accepted before.
-        state.controller = start(self.config, self.policy, module, count, local).ok();
+        state.controller = Some(controller);
         state.next_poll_ns = now;
         state.acted = 0;
         state.acted_ns = now;
         self.next_poll_ns = self.next_poll_ns.min(now);
         self.bus.plug(now, node);
+        Ok(())
     }
 
     /// A plant step has ended at `now`; the next begins with these torques.
@@ -630,10 +709,15 @@ impl<'a, 'c> Engine<'a, 'c> {
                     candump::write_entry(*out, *at_ns, &interface, frame)?;
                 }
                 for node in bus::nodes(*receivers) {
+                    if let Some(module) = self.module(node) {
+                        self.ask(plant, module, *at_ns, Some(frame))?;
+                    }
+                }
+                for node in bus::nodes(*receivers) {
                     if node == self.station_node {
                         self.tell_station(plant, frame, *at_ns);
                     } else if let Some(module) = self.module(node) {
-                        self.poll(plant, module, *at_ns, Some(frame));
+                        self.act(module, *at_ns)?;
                     }
                 }
                 if !late {
@@ -642,14 +726,15 @@ impl<'a, 'c> Engine<'a, 'c> {
                         if node == self.station_node {
                             self.tell(*at_ns);
                         } else if let Some(module) = self.module(node) {
-                            self.pump(module, *at_ns);
+                            self.pump(module, *at_ns)?;
                         }
                     }
                 }
             }
             Event::State { at_ns, node, .. } => {
                 if let Some(module) = self.module(*node) {
-                    self.poll(plant, module, *at_ns, None);
+                    self.ask(plant, module, *at_ns, None)?;
+                    self.act(module, *at_ns)?;
                 }
             }
             Event::ErrorFrame { .. } => {}
@@ -678,55 +763,89 @@ impl<'a, 'c> Engine<'a, 'c> {
         }
     }
 
-    fn poll_due<P: Plant + ?Sized>(&mut self, plant: &P, now: u64) {
+    fn poll_due<P: Plant + ?Sized>(&mut self, plant: &P, now: u64) -> Result<(), SilError> {
         if self.next_poll_ns > now {
-            return;
+            return Ok(());
+        }
+        let due = |module: &Module<L::Computer>| module.next_poll_ns <= now;
+        for module in 0..self.modules.len() {
+            if due(&self.modules[module]) {
+                self.ask(plant, module, now, None)?;
+            }
         }
         for module in 0..self.modules.len() {
-            if self.modules[module].next_poll_ns <= now {
-                self.poll(plant, module, now, None);
+            if due(&self.modules[module]) {
+                self.act(module, now)?;
             }
         }
         self.next_poll_ns = self.modules.iter().map(|state| state.next_poll_ns).min().unwrap_or(NEVER);
+        Ok(())
     }
 
-    fn poll<P: Plant + ?Sized>(&mut self, plant: &P, module: usize, now: u64, frame: Option<&Frame>) {
+    /// Polls a module. Nothing comes of it before [`Engine::act`], so several can be asked at once.
+    fn ask<P: Plant + ?Sized>(
+        &mut self,
+        plant: &P,
+        module: usize,
+        now: u64,
+        frame: Option<&Frame>,
+    ) -> Result<(), SilError> {
         let node = self.node(module);
-        let status = match self.bus.state(node) {
+        let bus = match self.bus.state(node) {
             ErrorState::Active => BusStatus::ErrorActive,
             ErrorState::Passive => BusStatus::ErrorPassive,
             ErrorState::BusOff => BusStatus::BusOff,
         };
+        let room = self.bus.room(node);
         let state = &mut self.modules[module];
-        let Some(controller) = &mut state.controller else { return };
+        let Some(controller) = &mut state.controller else { return Ok(()) };
         let sensors = match &state.sensors {
             SensorState::Good => &*state.sample.get_or_insert_with(|| plant.sensors(module)),
             SensorState::Zeroed => &Sensors::ZERO,
             SensorState::Stuck(sample) => sample,
         };
-        let outputs = controller.poll(state.clock.show(now), sensors, frame, status);
+        let poll = Poll { now: state.clock.show(now), sensors, frame, bus, room };
+        match controller.ask_poll(&poll) {
+            Ok(()) => Ok(()),
+            Err(trouble) => self.lose(module, now, trouble),
+        }
+    }
+
+    /// What a module that was polled does.
+    fn act(&mut self, module: usize, now: u64) -> Result<(), SilError> {
+        let state = &mut self.modules[module];
+        let Some(controller) = &mut state.controller else { return Ok(()) };
+        let answer = match controller.answer() {
+            Ok(answer) => answer,
+            Err(trouble) => return self.lose(module, now, trouble),
+        };
+        let outputs = answer.outputs;
         let torque = if outputs.motors_enabled { outputs.torque } else { [0.0; AXES] };
         if torque != state.commanded {
             state.commanded = torque;
             state.coming.push_back((now + u64::from(self.config.act_latency_us) * 1000, torque));
         }
-        let acted = controller.stats().acted;
-        if acted != state.acted {
-            state.acted = acted;
+        if answer.acted != state.acted {
+            state.acted = answer.acted;
             state.longest_gap_ns = state.longest_gap_ns.max(now - state.acted_ns);
             state.acted_ns = now;
         }
         state.next_poll_ns = state.clock.reaches(outputs.deadline).max(now + 1);
         self.next_poll_ns = self.next_poll_ns.min(state.next_poll_ns);
-        self.pump(module, now);
+        self.pump(module, now)
     }
 
     /// Hands the controller's frames to its CAN port.
-    fn pump(&mut self, module: usize, now: u64) {
+    fn pump(&mut self, module: usize, now: u64) -> Result<(), SilError> {
         let node = self.node(module);
-        let Some(controller) = &mut self.modules[module].controller else { return };
-        while self.bus.has_room(node) {
-            let Some(frame) = controller.next_frame() else { return };
+        loop {
+            let room = self.bus.room(node);
+            let Some(controller) = self.modules[module].controller.as_mut().filter(|_| room > 0) else { return Ok(()) };
+            let frame = match controller.next_frame(room) {
+                Ok(Some(frame)) => frame,
+                Ok(None) => return Ok(()),
+                Err(trouble) => return self.lose(module, now, trouble),
+            };
             let function = frame.function();
             // What still waits in the port is out of date, pieces of the same latent apart.
             let same_latent = |waiting: &Frame| {
@@ -741,24 +860,32 @@ impl<'a, 'c> Engine<'a, 'c> {
         }
     }
 
-    fn view<P: Plant + ?Sized>(&self, cycle: u32, at_ns: u64, plant: &P, observer: &mut dyn FnMut(&CycleView<'_>, &P)) {
+    fn view<P: Plant + ?Sized>(
+        &mut self,
+        cycle: u32,
+        at_ns: u64,
+        plant: &P,
+        observer: &mut dyn FnMut(&CycleView<'_>, &P),
+    ) -> Result<(), SilError> {
         const NOTHING: &[u16; MAX_MODULES] = &[0; MAX_MODULES];
+        self.ask_all(at_ns)?;
         let modules: Vec<ModuleView<'_>> = self
             .modules
             .iter()
             .enumerate()
             .map(|(module, state)| {
-                let controller = state.controller.as_ref();
+                let status = state.controller.as_ref().map(Computer::status);
+                let status = status.as_ref();
                 ModuleView {
-                    plugged: controller.is_some(),
-                    mode: controller.map_or(Mode::Boot, |c| c.mode()),
-                    cycle: controller.map_or(0, |c| c.cycle()),
-                    time_keeper: controller.and_then(|c| c.time_keeper()),
-                    alive: controller.map_or(0, |c| c.alive()),
-                    heard: controller.map_or(0, |c| c.heard()),
-                    attention: controller.map_or(NOTHING, |c| c.attention()),
+                    plugged: status.is_some(),
+                    mode: status.map_or(Mode::Boot, |s| s.mode),
+                    cycle: status.map_or(0, |s| s.cycle),
+                    time_keeper: status.and_then(|s| s.time_keeper),
+                    alive: status.map_or(0, |s| s.alive),
+                    heard: status.map_or(0, |s| s.heard),
+                    attention: status.map_or(NOTHING, |s| s.attention),
                     torque: state.applied.unwrap_or_default(),
-                    faults: controller.map_or(FaultSet::EMPTY, |c| c.faults()),
+                    faults: status.map_or(FaultSet::EMPTY, |s| s.faults),
                     bus: self.bus.state(self.node(module)),
                 }
             })
@@ -768,9 +895,25 @@ impl<'a, 'c> Engine<'a, 'c> {
             _ => set,
         });
         observer(&CycleView { cycle, at_ns, modules: &modules, cuts }, plant);
+        Ok(())
     }
 
-    fn report(&self, now: u64, cut_short: bool) -> SilReport {
+    /// Looks what all modules are at.
+    fn ask_all(&mut self, now: u64) -> Result<(), SilError> {
+        for answer in [false, true] {
+            for module in 0..self.modules.len() {
+                let Some(controller) = &mut self.modules[module].controller else { continue };
+                let done = if answer { controller.await_status() } else { controller.ask_status() };
+                if let Err(trouble) = done {
+                    self.lose(module, now, trouble)?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn report(&mut self, now: u64, cut_short: bool) -> Result<SilReport, SilError> {
+        self.ask_all(now)?;
         let modules: Vec<ModuleReport> = self
             .modules
             .iter()
@@ -779,7 +922,7 @@ impl<'a, 'c> Engine<'a, 'c> {
                 let last = state.controller.as_ref().map_or(0, |_| now.saturating_sub(state.acted_ns));
                 let node = self.node(module);
                 ModuleReport {
-                    stats: state.controller.as_ref().map_or(state.past, |c| add(&state.past, c.stats())),
+                    stats: state.controller.as_ref().map_or(state.past, |c| add(&state.past, &c.status().stats)),
                     bus: self.bus.node_stats(node),
                     errors: self.bus.counters(node),
                     longest_gap_ms: state.longest_gap_ns.max(last) as f64 / 1e6,
@@ -789,7 +932,7 @@ impl<'a, 'c> Engine<'a, 'c> {
         let age = modules.iter().map(|module| module.stats.latent_age_max_us).max().unwrap_or(0);
         let age = if age > 0 { f64::from(age) + f64::from(self.config.act_latency_us) } else { 0.0 };
         let stats = self.bus.stats();
-        SilReport {
+        Ok(SilReport {
             duration_ns: now,
             cycles: modules.iter().map(|module| module.stats.cycles).max().unwrap_or(0),
             bus_load: self.bus.load(now),
@@ -800,28 +943,15 @@ impl<'a, 'c> Engine<'a, 'c> {
             dropped: stats.dropped,
             frame_latency_max_ms: stats.worst_latency_ns as f64 / 1e6,
             faults: self.config.faults.iter().filter(|fault| fault.at_ns <= now).copied().collect(),
+            lost: self.lost.clone(),
             cut_short,
             modules,
-        }
+        })
     }
 }
 
-fn start<'a>(
-    config: &SilConfig,
-    policy: Policy<'a>,
-    module: usize,
-    count: usize,
-    now: Micros,
-) -> Result<Controller<'a>, SilError> {
-    let node = config.numbers.get(module).copied().unwrap_or(module as u8);
-    let mut setup = Config::new(node, count as u8, config.bus, &policy);
-    setup.bus_off = config.bus_off;
-    setup.timing = config.timing.unwrap_or(setup.timing);
-    Controller::new(setup, policy, now).map_err(SilError::Config)
-}
-
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use crate::candump;
     use crate::faults::FaultPlan;
@@ -831,16 +961,16 @@ mod tests {
     const MS: u64 = 1_000_000;
 
     /// Joints whose speed follows the torque; whatever was applied is kept.
-    struct Toy {
+    pub(crate) struct Toy {
         modules: usize,
         steps: usize,
         angles: Vec<[f32; 4]>,
         torques: Vec<[f32; 2]>,
-        history: Vec<Vec<[f32; 2]>>,
+        pub(crate) history: Vec<Vec<[f32; 2]>>,
     }
 
     impl Toy {
-        fn new(modules: usize, cycles: usize) -> Self {
+        pub(crate) fn new(modules: usize, cycles: usize) -> Self {
             let angles = (0..modules).map(|m| [0.1 * m as f32, -0.05, 0.02 * m as f32, 0.1]).collect();
             Toy { modules, steps: 5 * cycles, angles, torques: vec![[0.0; 2]; modules], history: Vec::new() }
         }
@@ -890,7 +1020,7 @@ mod tests {
         }
     }
 
-    fn image() -> [u8; IMAGE_SIZE] {
+    pub(crate) fn image() -> [u8; IMAGE_SIZE] {
         let mut image = [0; IMAGE_SIZE];
         random_image(1, &mut image);
         image

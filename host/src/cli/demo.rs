@@ -79,7 +79,15 @@ impl Shipped {
             threads: None,
         };
         let bus = BusOptions::default();
-        let trial = BusTrial { config: self.config.clone(), image: self.image, common: &common, bus: &bus, record };
+        let trial = BusTrial {
+            config: self.config.clone(),
+            image: self.image,
+            common: &common,
+            bus: &bus,
+            record,
+            qemu: None,
+            parity: false,
+        };
         let bar = common.bar();
         let result = trial.run(None, &|| bar.inc(1));
         bar.finish_and_clear();

@@ -3,12 +3,16 @@
 use std::io::Write;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
 use composer_firmware::controller::{BusKind, Timing};
+use composer_shared::policy::Policy;
+use composer_shared::robot::AXES;
+use composer_sim_bridge::computer::{InProcess, Launcher};
 use composer_sim_bridge::faults::{FaultKind, PlannedFault};
 use composer_sim_bridge::frame_bits::BitRates;
+use composer_sim_bridge::qemu::{self, Qemu};
 use composer_sim_bridge::sil::{self, SilConfig, SilReport};
 use serde::Serialize;
 
@@ -50,6 +54,57 @@ pub struct BusOptions {
     pub delay: Option<f64>,
 }
 
+/// What the controllers run on.
+#[derive(clap::Args, Clone, Debug)]
+pub struct Emulation {
+    /// Run every module's firmware image in an emulated microcontroller of its own (needs qemu-system-arm)
+    #[arg(long)]
+    pub qemu: bool,
+    /// Image of the module, an ELF file [default: the one that `cargo qemu-image` builds]
+    #[arg(long, value_name = "FILE", requires = "qemu")]
+    pub qemu_image: Option<PathBuf>,
+    /// Seconds after which an emulated module that does not answer is given up
+    #[arg(long, value_name = "S", requires = "qemu", default_value_t = qemu::PATIENCE.as_secs_f64())]
+    pub qemu_timeout: f64,
+    /// Run every episode in this process too, and compare all torques bit for bit
+    #[arg(long, requires = "qemu")]
+    pub parity: bool,
+}
+
+impl Emulation {
+    /// The emulated modules, tried out; none if they are not asked for.
+    fn launcher(&self, image: &[u8]) -> Result<Option<Qemu>> {
+        if !self.qemu {
+            return Ok(None);
+        }
+        if !(0.001..=86_400.0).contains(&self.qemu_timeout) {
+            bail!("--qemu-timeout is 0.001 to 86400 s");
+        }
+        let firmware = match &self.qemu_image {
+            Some(file) => file.clone(),
+            None => built_image()
+                .context("it is not known where this program lies: say where the image is with --qemu-image")?,
+        };
+        let qemu = Qemu::new(&firmware, image, Duration::from_secs_f64(self.qemu_timeout))?;
+        let policy = Policy::parse(image).map_err(|e| anyhow::anyhow!("{e}"))?;
+        if !qemu.probe(&policy)?.same_controller {
+            eprintln!(
+                "note: {} was not built from the sources of this program; `cargo qemu-image` builds it anew",
+                firmware.display()
+            );
+        }
+        Ok(Some(qemu))
+    }
+}
+
+/// Where `cargo qemu-image` puts the image: in the same target folder as this program, which lies in `target/release` or, a test, below.
+fn built_image() -> Option<PathBuf> {
+    let program = std::env::current_exe().ok()?;
+    let release = program.parent()?;
+    let target = if release.ends_with("deps") { release.parent()?.parent()? } else { release.parent()? };
+    Some(target.join("thumbv7em-none-eabihf/release/composer-qemu"))
+}
+
 /// Arguments of `sil`.
 #[derive(clap::Args, Clone, Debug)]
 pub struct Arguments {
@@ -57,6 +112,8 @@ pub struct Arguments {
     common: Common,
     #[command(flatten)]
     bus: BusOptions,
+    #[command(flatten)]
+    emulation: Emulation,
     /// Write the frames of the first episode as a candump log
     #[arg(long, value_name = "FILE")]
     capture: Option<PathBuf>,
@@ -86,6 +143,52 @@ pub struct BusReport {
     pub error_frames: u64,
     /// Virtual time by wall time of one thread, physics included.
     pub realtime_factor: f64,
+    /// Emulated modules that somebody else ended.
+    pub lost: usize,
+    /// What the comparison with controllers in this process came to.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub parity: Option<Parity>,
+}
+
+/// A comparison of emulated modules with controllers in this process.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Parity {
+    /// Control cycles compared, over all episodes.
+    pub cycles: u64,
+    /// Torques compared: yaw and pitch of every module at every physics step.
+    pub torques: u64,
+    /// Those of them whose bits differ.
+    pub different: u64,
+    /// Episodes in which anything else differs: their length, the bus, the modules' counters.
+    pub other: u64,
+}
+
+impl Parity {
+    fn of(ours: &Outcome, theirs: &Outcome) -> Self {
+        let (a, b) = (ours.plant.trace(), theirs.plant.trace());
+        let same = a.iter().flatten().zip(b.iter().flatten()).filter(|(a, b)| a == b).count();
+        let torques = AXES * a.len().max(b.len());
+        Parity {
+            cycles: u64::from(ours.plant.judge().steps()),
+            torques: torques as u64,
+            different: (torques - same) as u64,
+            other: u64::from(ours.report != theirs.report || ours.plant.episode() != theirs.plant.episode()),
+        }
+    }
+
+    fn add(self, other: Self) -> Self {
+        Parity {
+            cycles: self.cycles + other.cycles,
+            torques: self.torques + other.torques,
+            different: self.different + other.different,
+            other: self.other + other.other,
+        }
+    }
+
+    /// Whether there is no difference.
+    pub fn holds(&self) -> bool {
+        self.different == 0 && self.other == 0
+    }
 }
 
 /// Everything that defines a set of episodes on the bus.
@@ -100,6 +203,10 @@ pub struct BusTrial<'a> {
     pub bus: &'a BusOptions,
     /// How many of the first episodes to record.
     pub record: usize,
+    /// The emulated modules, if the controllers do not run in this process.
+    pub qemu: Option<&'a Qemu>,
+    /// Compare them with controllers in this process.
+    pub parity: bool,
 }
 
 /// One episode on the bus, and how long it took.
@@ -108,6 +215,13 @@ struct Run {
     report: SilReport,
     wall: f64,
     recorded: Option<crate::replay::Episode>,
+    parity: Option<Parity>,
+}
+
+/// What became of the plant, and the report.
+struct Outcome {
+    plant: SnakePlant,
+    report: SilReport,
 }
 
 impl BusTrial<'_> {
@@ -132,19 +246,56 @@ impl BusTrial<'_> {
     fn episode(&self, index: usize, capture: Option<&mut dyn Write>) -> Result<Run> {
         let seed = episode_seed(self.common.seed, index as u64);
         let sil = self.sil_config(seed);
-        let mut plant = SnakePlant::new(self.config.clone(), seed);
-        let mut recorder =
-            (index < self.record).then(|| Recorder::new(&format!("episode {}", index + 1), &plant, &sil.faults));
+        let policy = Policy::parse(self.image).map_err(|e| anyhow::anyhow!("{e}"))?;
+        let local = InProcess::new(policy);
+        let name = format!("episode {}", index + 1);
+        let mut recorder = None;
         let start = Instant::now();
-        let report = sil::run(&mut plant, self.image, &sil, capture, &mut |cycle, plant| {
-            if let Some(recorder) = &mut recorder {
+        let ours = match self.qemu {
+            Some(qemu) => {
+                self.simulate(qemu, policy, &sil, capture, (index < self.record).then_some(&name), &mut recorder)
+            }
+            None => self.simulate(&local, policy, &sil, capture, (index < self.record).then_some(&name), &mut recorder),
+        }
+        .map_err(|error| if self.qemu.is_some() { error.context(name.clone()) } else { error })?;
+        let wall = start.elapsed().as_secs_f64();
+        for lost in &ours.report.lost {
+            eprintln!(
+                "note: {name}: module {} was lost at {:.3} s: {}",
+                lost.module,
+                lost.at_ns as f64 * 1e-9,
+                lost.how
+            );
+        }
+        let parity = match self.parity {
+            false => None,
+            true => Some(Parity::of(&ours, &self.simulate(&local, policy, &sil, None, None, &mut None)?)),
+        };
+        let Outcome { plant, report } = ours;
+        let episode = plant.episode();
+        let recorded = recorder.map(|r| r.finish(&episode, &report));
+        Ok(Run { episode, report, wall, recorded, parity })
+    }
+
+    /// Runs one episode with the controllers of `launcher`; `recorder` becomes one if it gets a name.
+    fn simulate<L: Launcher>(
+        &self,
+        launcher: &L,
+        policy: Policy<'_>,
+        sil: &SilConfig,
+        capture: Option<&mut dyn Write>,
+        recorded: Option<&String>,
+        recorder: &mut Option<Recorder>,
+    ) -> Result<Outcome> {
+        let new = if self.parity { SnakePlant::traced } else { SnakePlant::new };
+        let mut plant = new(self.config.clone(), sil.seed);
+        *recorder = recorded.map(|name| Recorder::new(name, &plant, &sil.faults));
+        let report = sil::run_on(launcher, &mut plant, policy, sil, capture, &mut |cycle, plant| {
+            if let Some(recorder) = recorder {
                 recorder.cycle(cycle, plant);
             }
         })?;
-        let wall = start.elapsed().as_secs_f64();
-        let episode = plant.episode();
-        let recorded = recorder.map(|r| r.finish(&episode, &report));
-        Ok(Run { episode, report, wall, recorded })
+        Ok(Outcome { plant, report })
     }
 
     /// Runs all episodes. `progress` is called after each.
@@ -187,6 +338,8 @@ impl BusTrial<'_> {
             deadline_misses: runs.iter().map(|r| r.report.deadline_misses).sum(),
             error_frames: runs.iter().map(|r| r.report.error_frames).sum(),
             realtime_factor: virtual_time / runs.iter().map(|r| r.wall).sum::<f64>().max(1e-9),
+            lost: runs.iter().map(|r| r.report.lost.len()).sum(),
+            parity: runs.iter().filter_map(|r| r.parity).reduce(Parity::add),
         };
         Ok((report, runs.into_iter().filter_map(|r| r.recorded).collect()))
     }
@@ -205,7 +358,16 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let config = Arc::new(source.environment(common.task, common.robot()?.as_ref())?);
     warn_if_crowded(&arguments.bus, &config);
     let record = if arguments.replay.is_some() { REPLAYED } else { 0 };
-    let trial = BusTrial { config: config.clone(), image, common, bus: &arguments.bus, record };
+    let qemu = arguments.emulation.launcher(image)?;
+    let trial = BusTrial {
+        config: config.clone(),
+        image,
+        common,
+        bus: &arguments.bus,
+        record,
+        qemu: qemu.as_ref(),
+        parity: arguments.emulation.parity,
+    };
     let mut captured = Vec::new();
     let capture: Option<&mut dyn Write> = if arguments.capture.is_some() { Some(&mut captured) } else { None };
     let bar = common.bar();
@@ -219,11 +381,14 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     }
     if common.json {
         println!("{}", serde_json::to_string(&report)?);
-        return Ok(());
+    } else {
+        print!("{}{}", table(&report.task), bus_table(&report));
+        for path in arguments.capture.iter().chain(&arguments.replay) {
+            println!("  written: {}", path.display());
+        }
     }
-    print!("{}{}", table(&report.task), bus_table(&report));
-    for path in arguments.capture.iter().chain(&arguments.replay) {
-        println!("  written: {}", path.display());
+    if report.parity.is_some_and(|parity| !parity.holds()) {
+        bail!("the emulated modules and those in this process do not do the same: see the line about parity");
     }
     Ok(())
 }
@@ -245,15 +410,23 @@ fn warn_if_crowded(bus: &BusOptions, config: &EnvConfig) {
 
 /// The lines about the bus.
 pub fn bus_table(report: &BusReport) -> String {
-    format!(
-        "  bus {}: load {:.1} %, oldest latent {:.1} ms, {} deadline misses, {} error frames, {:.0} times real time\n",
+    let mut text = format!(
+        "  bus {}: load {:.1} %, oldest latent {:.1} ms, {} deadline misses, {} error frames, {:.*} times real time\n",
         report.bus,
         100.0 * report.bus_load,
         report.latent_age_max_ms,
         report.deadline_misses,
         report.error_frames,
+        if report.realtime_factor < 10.0 { 2 } else { 0 },
         report.realtime_factor
-    )
+    );
+    if let Some(parity) = &report.parity {
+        text += &format!(
+            "  parity with controllers in this process: {} torques of {} control cycles compared, {} differ; {} episodes differ in anything else\n",
+            parity.torques, parity.cycles, parity.different, parity.other
+        );
+    }
+    text
 }
 
 /// Writes recorded episodes as one page.
