@@ -249,6 +249,16 @@ impl Episode {
         self.summary.push((name.into(), value.into()));
     }
 
+    /// What it is about, and what stands there.
+    pub fn setting(&self) -> &Setting {
+        &self.setting
+    }
+
+    /// Its control steps.
+    pub fn frames(&self) -> &[FrameRecord] {
+        &self.frames
+    }
+
     /// Control steps so far.
     pub fn len(&self) -> usize {
         self.frames.len()

@@ -17,7 +17,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::{Course, Gate, Point, Rules, Verdict, between, check_number, check_range, distance, either_side};
+use super::{Course, Gate, Point, Rules, Verdict, Words, between, check_number, check_range, distance, either_side};
 use crate::robot::Robot;
 use crate::sim::Snake;
 use crate::sim::scene::{Block, Scene};
@@ -97,6 +97,10 @@ impl Rules for BlockPushing {
 
     fn goal_radius(&self) -> f32 {
         self.success_distance
+    }
+
+    fn words(&self) -> Words {
+        Words { measure: "block to goal", done: "block at the goal", missed: "block not at the goal" }
     }
 
     fn course(&self, seed: u64, _robot: &Robot) -> Course {

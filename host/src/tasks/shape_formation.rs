@@ -19,7 +19,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::{Course, Gate, Point, Rules, Verdict, check_number, distance, either_side};
+use super::{Course, Gate, Point, Rules, Verdict, Words, check_number, distance, either_side};
 use crate::robot::Robot;
 use crate::sim::{Scene, Snake};
 
@@ -182,6 +182,14 @@ impl Rules for ShapeFormation {
 
     fn goal_radius(&self) -> f32 {
         0.0
+    }
+
+    fn threshold(&self) -> f32 {
+        self.success_distance
+    }
+
+    fn words(&self) -> Words {
+        Words { measure: "modules to their targets, mean", done: "shape formed", missed: "shape not formed" }
     }
 
     fn course(&self, seed: u64, robot: &Robot) -> Course {

@@ -17,7 +17,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::{Course, Gate, Point, Rules, Verdict, between, check_number, check_range, distance, either_side};
+use super::{Course, Gate, Point, Rules, Verdict, Words, between, check_number, check_range, distance, either_side};
 use crate::robot::Robot;
 use crate::sim::Snake;
 use crate::sim::scene::{Scene, Solid};
@@ -247,6 +247,14 @@ impl Rules for TubeCrossing {
 
     fn goal_radius(&self) -> f32 {
         self.success_distance
+    }
+
+    fn words(&self) -> Words {
+        Words {
+            measure: "head to goal",
+            done: "through the tube to the goal",
+            missed: "not through the tube to the goal",
+        }
     }
 
     fn course(&self, seed: u64, robot: &Robot) -> Course {

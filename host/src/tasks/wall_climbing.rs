@@ -15,7 +15,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::{Course, Gate, Point, Rules, Verdict, between, check_number, check_range, either_side};
+use super::{Course, Gate, Point, Rules, Verdict, Words, between, check_number, check_range, either_side};
 use crate::robot::Robot;
 use crate::sim::Snake;
 use crate::sim::scene::{Scene, Solid};
@@ -100,6 +100,10 @@ impl Rules for WallClimbing {
 
     fn goal_radius(&self) -> f32 {
         0.0
+    }
+
+    fn words(&self) -> Words {
+        Words { measure: "tail to the far side of the wall", done: "over the wall", missed: "not over the wall" }
     }
 
     fn course(&self, seed: u64, robot: &Robot) -> Course {
