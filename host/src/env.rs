@@ -399,14 +399,20 @@ mod tests {
     #[test]
     fn the_same_seed_and_actions_give_the_same_bits_after_any_history() {
         let faults = FaultTraining { probability: 1.0, missed_latents: 0.1, ..FaultTraining::default() };
-        let config =
-            Arc::new(EnvConfig { faults, delay: [1, 2], ..EnvConfig::new(Task::GoalReaching, Robot::default()) });
-        let mut fresh = SnakeEnv::new(config.clone());
-        let mut used = SnakeEnv::new(config);
-        drive(&mut used, 30);
-        fresh.reset(42);
-        used.reset(42);
-        assert_eq!(drive(&mut fresh, 60), drive(&mut used, 60));
+        for task in Task::ALL {
+            let faults = faults.clone();
+            let config = Arc::new(EnvConfig { faults, delay: [1, 2], ..EnvConfig::new(task, Robot::default()) });
+            let mut fresh = SnakeEnv::new(config.clone());
+            let mut used = SnakeEnv::new(config);
+            drive(&mut used, 30);
+            fresh.reset(42);
+            used.reset(42);
+            assert_eq!(drive(&mut fresh, 60), drive(&mut used, 60), "{task}");
+            assert!(
+                fresh.snake().poses().eq(used.snake().poses()) && fresh.snake().block() == used.snake().block(),
+                "{task}"
+            );
+        }
     }
 
     #[test]

@@ -284,6 +284,18 @@ impl Trial<'_> {
         Report::new(&episodes, self.config.robot.modules, fault)
     }
 
+    /// Runs the first `count` episodes again and records them.
+    pub fn record(&self, pilot: Pilot, count: usize) -> Vec<crate::replay::Episode> {
+        let mut env = SnakeEnv::new(self.config.clone());
+        let record = |index: usize| {
+            let seed = episode_seed(self.seed, index as u64);
+            let faults = (self.faults)(seed, self.config.robot.modules);
+            let name = format!("episode {}", index + 1);
+            crate::recorder::simulate(self.config, &mut env, pilot, &name, seed, &faults)
+        };
+        (0..count.min(self.episodes)).map(record).collect()
+    }
+
     /// Observations of all modules at every step, for calibrating and checking a frozen policy.
     pub fn observations(&self, network: &Network) -> Vec<Vec<Observation>> {
         let episodes = self.run(|env, seed, faults| {

@@ -46,6 +46,11 @@ impl SnakePlant {
         &self.snake
     }
 
+    /// The environment.
+    pub fn config(&self) -> &EnvConfig {
+        &self.config
+    }
+
     /// The scene of the episode and what came of it so far.
     pub fn judge(&self) -> &Judge {
         &self.judge

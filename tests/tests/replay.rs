@@ -5,10 +5,23 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use composer_host::replay::{Episode, FrameRecord, Outline, Pose, Recording, Robot, Shape, Status, attention_bytes};
+use composer_host::replay::{
+    Episode, FrameRecord, Look, Outline, Pose, Recording, Robot, Setting, Shape, Status, attention_bytes,
+};
 
 const PERIOD: f32 = 0.05;
 const LINKS: usize = 4;
+
+/// A goal to be reached, and nothing else there.
+fn reaching() -> Setting {
+    Setting {
+        task: "Goal Reaching".into(),
+        measure: "head to goal".into(),
+        threshold: 1.0,
+        goal_radius: 1.0,
+        ..Setting::default()
+    }
+}
 
 /// A snake that winds its way towards a goal at the left; `unplugged` loses its power half way.
 fn episode(modules: usize, frames: usize, unplugged: usize) -> Episode {
@@ -25,7 +38,7 @@ fn episode(modules: usize, frames: usize, unplugged: usize) -> Episode {
         path.push([last[0] + ds * angle(s).cos(), last[1] + ds * angle(s).sin(), 0.0]);
     }
     let shift = path[(before / ds) as usize];
-    let mut episode = Episode::new(format!("goal ahead and left, {modules} modules"));
+    let mut episode = Episode::new(format!("goal ahead and left, {modules} modules"), reaching());
     for frame in 0..frames {
         let head = frame as f32 * 0.15;
         let at = |link: usize| {
@@ -90,7 +103,7 @@ fn robot(modules: usize) -> Robot {
 
 fn recording(modules: usize) -> Recording {
     let title = "Goal reaching over a simulated CAN-FD bus";
-    let mut recording = Recording::new(title, "goal-reaching", robot(modules), 1.0);
+    let mut recording = Recording::new(title, robot(modules));
     recording.note("bus", "CAN-FD 1M/5M");
     recording.push(episode(modules, 110, modules * 3 / 8));
     recording.push(episode(modules, 61, 0));
@@ -218,7 +231,7 @@ fn a_damaged_file_says_so() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("replay.html");
     let html = recording(2).to_html().unwrap();
-    fs::write(&path, html.replacen("\"format\":1", "\"format\":9", 1)).unwrap();
+    fs::write(&path, html.replacen("\"format\":2", "\"format\":9", 1)).unwrap();
     let dom = open(&browser(), &path, "");
     assert_eq!(attribute(&dom, "data-ready"), Some("false"));
     assert!(dom.contains("This replay cannot be shown: Uncaught Error: its format 9 is not known"));
@@ -226,17 +239,21 @@ fn a_damaged_file_says_so() {
 
 /// A block that is pushed aside between a wall, a tube, a post and a wanted place; no goal, no attention, all relaxed.
 fn scene(modules: usize) -> Recording {
-    let mut recording = Recording::new("A scene", "block-pushing", robot(modules), 0.0);
-    for (outline, ghost, moves) in [
-        (Outline::Box { half: [0.5, 4.0, 2.0] }, false, false),
-        (Outline::Tube { radius: 1.2, half_length: 3.0 }, false, false),
-        (Outline::Box { half: [1.0; 3] }, false, true),
-        (Outline::Cylinder { radius: 0.5, half_length: 1.0 }, false, false),
-        (Outline::Sphere { radius: 1.0 }, true, false),
-    ] {
-        recording.shape(Shape { outline, pose: Pose::at([6.0, -6.0, 1.0]), ghost, moves });
-    }
-    let mut episode = Episode::new("pushed");
+    let shapes = [
+        (Outline::Box { half: [0.5, 4.0, 2.0] }, Look::Solid, false, "wall"),
+        (Outline::Box { half: [0.2, 40.0, 1.0] }, Look::Glass, false, ""),
+        (Outline::Tube { radius: 1.2, half_length: 3.0 }, Look::Glass, false, ""),
+        (Outline::Box { half: [1.0; 3] }, Look::Solid, true, "block"),
+        (Outline::Cylinder { radius: 0.5, half_length: 1.0 }, Look::Solid, false, ""),
+        (Outline::Sphere { radius: 1.0 }, Look::Wanted, false, "0"),
+    ];
+    let scene = shapes.map(|(outline, look, moves, label)| {
+        let pose = Pose::at([6.0, -6.0, 1.0]);
+        Shape { outline, pose, look, moves, label: label.into() }
+    });
+    let setting = Setting { task: "Block Pushing".into(), scene: scene.into(), ..Setting::default() };
+    let mut recording = Recording::new("A scene", robot(modules));
+    let mut episode = Episode::new("pushed", setting);
     for i in 0..2 {
         episode.push(FrameRecord {
             time: i as f32,

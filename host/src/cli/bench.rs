@@ -30,8 +30,8 @@ pub struct Arguments {
 }
 
 /// Control steps per second over all threads.
-fn physics(robot: &Robot, threads: usize, seconds: f64) -> f64 {
-    let config = Arc::new(EnvConfig::new(Task::GoalReaching, robot.clone()));
+fn physics(task: Task, robot: &Robot, threads: usize, seconds: f64) -> f64 {
+    let config = Arc::new(EnvConfig::new(task, robot.clone()));
     let rates = parallel(threads, threads, |thread| {
         let mut env = SnakeEnv::new(config.clone());
         let (mut view, mut actions) = (View::default(), Vec::new());
@@ -49,6 +49,18 @@ fn physics(robot: &Robot, threads: usize, seconds: f64) -> f64 {
         steps as f64 / start.elapsed().as_secs_f64()
     });
     rates.iter().sum()
+}
+
+/// Control steps per second of each task on one thread. They take turns, so that other load on the machine slows all of them alike.
+fn scenes(robot: &Robot, seconds: f64) -> Vec<(Task, f64)> {
+    const TURNS: usize = 10;
+    let mut rates: Vec<(Task, f64)> = Task::ALL.map(|task| (task, 0.0)).into();
+    for _ in 0..TURNS {
+        for (task, rate) in &mut rates {
+            *rate += physics(*task, robot, 1, seconds / TURNS as f64) / TURNS as f64;
+        }
+    }
+    rates
 }
 
 /// Time spent in training iterations after the first, which warms up.
@@ -86,9 +98,20 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let robot = Robot::default();
     println!("physics alone, control steps/s (0.05 s, {} physics steps each), random torques", 5);
     println!("{:>8} {:>12} {:>12}", "modules", "one thread", "all threads");
+    let goal = Task::GoalReaching;
     for modules in LENGTHS {
         let robot = robot.with_modules(modules)?;
-        println!("{modules:>8} {:>12.0} {:>12.0}", physics(&robot, 1, seconds), physics(&robot, cores, seconds));
+        println!(
+            "{modules:>8} {:>12.0} {:>12.0}",
+            physics(goal, &robot, 1, seconds),
+            physics(goal, &robot, cores, seconds)
+        );
+    }
+    println!("\nthe same with each task's scene, {} modules, one thread, side by side", robot.modules);
+    println!("{:>16} {:>16} {:>14}", "task", "control steps/s", "of the first");
+    let rates = scenes(&robot, seconds);
+    for (task, rate) in &rates {
+        println!("{:>16} {rate:>16.0} {:>14.2}", task.name(), rate / rates[0].1);
     }
     println!("\ntraining, {} modules, {cores} threads", robot.modules);
     println!("{:>24} {:>20} {:>9} {:>10} {:>7}", "method", "environment steps/s", "physics", "inference", "update");

@@ -112,7 +112,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             to_replay.extend(recorded);
         }
     }
-    write_replay(&first.config, to_replay, "all that ship", &arguments.replay)?;
+    write_replay(&first.config, "COMPOSER on the simulated bus", to_replay, "all that ship", &arguments.replay)?;
     footer(arguments, "an episode of every task with a module unplugged");
     Ok(())
 }
@@ -133,7 +133,8 @@ pub fn run_one(one: &OneTask) -> Result<()> {
         println!("{}", row(label, &report));
         to_replay.extend(recorded);
     }
-    write_replay(&policy.config, to_replay, policy.name, &arguments.replay)?;
+    let title = format!("{} on the simulated bus", one.task.title());
+    write_replay(&policy.config, &title, to_replay, policy.name, &arguments.replay)?;
     footer(arguments, "the first episodes with a module unplugged");
     Ok(())
 }

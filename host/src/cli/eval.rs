@@ -7,6 +7,7 @@ use anyhow::{Result, bail};
 use composer_shared::policy::Task;
 use indicatif::{ProgressBar, ProgressStyle};
 
+use super::sil::{REPLAYED, write_replay};
 use super::{PolicySource, task_by_name};
 use composer_sim_bridge::faults::{FaultPlan, ScheduledFault};
 
@@ -76,6 +77,9 @@ impl Common {
 pub struct Arguments {
     #[command(flatten)]
     common: Common,
+    /// Write the first episodes as one HTML page to look at
+    #[arg(long, value_name = "FILE")]
+    replay: Option<PathBuf>,
 }
 
 /// Runs the verb.
@@ -98,10 +102,17 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     };
     let report = trial.evaluate(source.pilot()?, &common.fault.to_string(), &|| bar.inc(1));
     bar.finish_and_clear();
+    if let Some(path) = &arguments.replay {
+        let title = format!("{} in the simulator", config.task.task().title());
+        write_replay(&config, &title, trial.record(source.pilot()?, REPLAYED), &common.policy, path)?;
+    }
     if common.json {
         println!("{}", serde_json::to_string(&report)?);
-    } else {
-        print!("{}", table(&report));
+        return Ok(());
+    }
+    print!("{}", table(&report));
+    if let Some(path) = &arguments.replay {
+        println!("  written: {}", path.display());
     }
     Ok(())
 }

@@ -377,7 +377,8 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         write_whole(path, &captured)?;
     }
     if let Some(path) = &arguments.replay {
-        write_replay(&config, recorded, &common.policy, path)?;
+        let title = format!("{} on the simulated bus", config.task.task().title());
+        write_replay(&config, &title, recorded, &common.policy, path)?;
     }
     if common.json {
         println!("{}", serde_json::to_string(&report)?);
@@ -432,11 +433,12 @@ pub fn bus_table(report: &BusReport) -> String {
 /// Writes recorded episodes as one page.
 pub fn write_replay(
     config: &EnvConfig,
+    title: &str,
     episodes: Vec<crate::replay::Episode>,
     policy: &str,
     path: &std::path::Path,
 ) -> Result<()> {
-    let mut recording = crate::recorder::recording(config, policy);
+    let mut recording = crate::recorder::recording(config, title, policy);
     for episode in episodes {
         recording.push(episode);
     }

@@ -1,6 +1,6 @@
 //! Replays: one self-contained HTML file in which an episode can be watched, offline, in any browser.
 //!
-//! A [`Recording`] collects [`Episode`]s, an episode one [`FrameRecord`] a control step; [`Recording::write_html`] quantises
+//! A [`Recording`] collects [`Episode`]s, an episode its [`Setting`] and one [`FrameRecord`] a control step; [`Recording::write_html`] quantises
 //! them and puts them into `page.html`, which holds all of its script and style itself. The page interpolates between frames.
 //!
 //! Units and frames are those of the robot ([`composer_shared::robot`]): robot units, seconds, world z up, the ground at
@@ -109,7 +109,7 @@ pub enum Outline {
         /// Half of its length.
         half_length: f32,
     },
-    /// A piece of an open tube along its own x axis; the page lets one look through its wall.
+    /// A piece of an open tube along its own x axis.
     Tube {
         /// Inner radius.
         radius: f32,
@@ -123,17 +123,46 @@ pub enum Outline {
     },
 }
 
-/// Something in the scene besides the snake: a wall, a block, a piece of a tube, a wanted pose.
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// How a [`Shape`] looks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Look {
+    /// Something there.
+    Solid,
+    /// Something there that one has to see through: the wall of a tube.
+    Glass,
+    /// Something wanted rather than something there: a target.
+    Wanted,
+}
+
+/// Something in the scene besides the snake: a wall, a block, a panel of a tube, a wanted place.
+#[derive(Clone, Debug, PartialEq)]
 pub struct Shape {
     /// Its outline.
     pub outline: Outline,
     /// Where it is; for a shape that moves, only until the first frame says otherwise.
     pub pose: Pose,
-    /// Drawn translucent, as something wanted rather than something there.
-    pub ghost: bool,
+    /// How it looks.
+    pub look: Look,
     /// Every frame gives its pose, in [`FrameRecord::moving`].
     pub moves: bool,
+    /// A word beside it; empty for none. Numbers are hidden with the numbers of the modules.
+    pub label: String,
+}
+
+/// What an episode is about, and what stands on the ground in it.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Setting {
+    /// The task's name.
+    pub task: String,
+    /// What [`FrameRecord::distance`] is the distance of, such as "block to goal".
+    pub measure: String,
+    /// The distance below which the task is done, robot units; 0 where that is not all.
+    pub threshold: f32,
+    /// Radius of the ball to be reached round the goal, robot units; 0 where the goal is only a direction.
+    pub goal_radius: f32,
+    /// What is there besides the snake.
+    pub scene: Vec<Shape>,
 }
 
 /// What a module is able to do at a time.
@@ -193,6 +222,7 @@ pub struct Event {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Episode {
     name: String,
+    setting: Setting,
     frames: Vec<FrameRecord>,
     events: Vec<Event>,
     summary: Vec<(String, String)>,
@@ -200,8 +230,8 @@ pub struct Episode {
 
 impl Episode {
     /// An episode without frames. The name is what the page's selector shows.
-    pub fn new(name: impl Into<String>) -> Self {
-        Episode { name: name.into(), ..Episode::default() }
+    pub fn new(name: impl Into<String>, setting: Setting) -> Self {
+        Episode { name: name.into(), setting, ..Episode::default() }
     }
 
     /// Adds a control step. Cheap: nothing is checked or encoded before the recording is written.
@@ -219,6 +249,16 @@ impl Episode {
         self.summary.push((name.into(), value.into()));
     }
 
+    /// What it is about, and what stands there.
+    pub fn setting(&self) -> &Setting {
+        &self.setting
+    }
+
+    /// Its control steps.
+    pub fn frames(&self) -> &[FrameRecord] {
+        &self.frames
+    }
+
     /// Control steps so far.
     pub fn len(&self) -> usize {
         self.frames.len()
@@ -234,31 +274,15 @@ impl Episode {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Recording {
     title: String,
-    task: String,
     robot: Robot,
-    goal_radius: f32,
-    scene: Vec<Shape>,
     summary: Vec<(String, String)>,
     episodes: Vec<Episode>,
 }
 
 impl Recording {
-    /// A recording without episodes. `goal_radius` is the distance that counts as success, robot units (0: none).
-    pub fn new(title: impl Into<String>, task: impl Into<String>, robot: Robot, goal_radius: f32) -> Self {
-        Recording {
-            title: title.into(),
-            task: task.into(),
-            robot,
-            goal_radius,
-            scene: Vec::new(),
-            summary: Vec::new(),
-            episodes: Vec::new(),
-        }
-    }
-
-    /// Adds a shape to the scene.
-    pub fn shape(&mut self, shape: Shape) {
-        self.scene.push(shape);
+    /// A recording without episodes.
+    pub fn new(title: impl Into<String>, robot: Robot) -> Self {
+        Recording { title: title.into(), robot, summary: Vec::new(), episodes: Vec::new() }
     }
 
     /// Adds a line to the table that holds for all episodes, such as ("bus", "CAN-FD 1M/5M").
@@ -278,16 +302,7 @@ impl Recording {
     pub fn to_html(&self) -> Result<String, ReplayError> {
         self.check()?;
         let episodes = self.episodes.iter().map(|e| self.encode(e)).collect();
-        let data = PageData {
-            format: 1,
-            title: &self.title,
-            task: &self.task,
-            robot: &self.robot,
-            goal_radius: self.goal_radius,
-            scene: self.scene.iter().map(PageShape::from).collect(),
-            summary: &self.summary,
-            episodes,
-        };
+        let data = PageData { format: 2, title: &self.title, robot: &self.robot, summary: &self.summary, episodes };
         // Text cannot close the script element or open a comment in it: '<' appears in JSON strings only.
         let json = serde_json::to_string(&data).expect("plain data encodes").replace('<', "\\u003c");
         let title = self.title.replace('&', "&amp;").replace('<', "&lt;");
@@ -333,20 +348,13 @@ impl Recording {
                 "every number of the robot must be greater than zero, got {robot:?}"
             )));
         }
-        if !self.goal_radius.is_finite() || self.goal_radius < 0.0 {
-            return Err(ReplayError::Header(format!(
-                "the goal's radius is {}; it must be zero or more",
-                self.goal_radius
-            )));
-        }
-        if let Some(shape) = self.scene.iter().find(|s| !s.pose.is_finite()) {
-            return Err(ReplayError::Header(format!("a shape of the scene has a pose that is not finite: {shape:?}")));
-        }
         if self.episodes.is_empty() {
             return Err(ReplayError::Empty("it has no episode; record at least one".into()));
         }
-        let moving = self.scene.iter().filter(|s| s.moves).count();
         for episode in &self.episodes {
+            let setting = &episode.setting;
+            let moving = setting.scene.iter().filter(|s| s.moves).count();
+            setting.check().map_err(|what| ReplayError::Header(format!("episode {:?} {what}", episode.name)))?;
             if episode.frames.is_empty() {
                 return Err(ReplayError::Empty(format!("episode {:?} has no frame", episode.name)));
             }
@@ -419,6 +427,11 @@ impl Recording {
         };
         PageEpisode {
             name: &episode.name,
+            task: &episode.setting.task,
+            measure: &episode.setting.measure,
+            threshold: episode.setting.threshold,
+            goal_radius: episode.setting.goal_radius,
+            scene: episode.setting.scene.iter().map(PageShape::from).collect(),
             frames: frames.len(),
             origin,
             step,
@@ -432,6 +445,20 @@ impl Recording {
             moving: moving.base64(),
             events: &episode.events,
             summary: &episode.summary,
+        }
+    }
+}
+
+impl Setting {
+    fn check(&self) -> Result<(), String> {
+        for (what, size) in [("goal's radius", self.goal_radius), ("threshold", self.threshold)] {
+            if !size.is_finite() || size < 0.0 {
+                return Err(format!("has a {what} of {size}; it must be zero or more"));
+            }
+        }
+        match self.scene.iter().find(|s| !s.pose.is_finite()) {
+            Some(shape) => Err(format!("has a shape in its scene whose pose is not finite: {shape:?}")),
+            None => Ok(()),
         }
     }
 }
@@ -477,38 +504,41 @@ impl FrameRecord {
 struct PageData<'a> {
     format: u32,
     title: &'a str,
-    task: &'a str,
     robot: &'a Robot,
-    goal_radius: f32,
-    scene: Vec<PageShape>,
     summary: &'a [(String, String)],
     episodes: Vec<PageEpisode<'a>>,
 }
 
 #[derive(Serialize)]
-struct PageShape {
+struct PageShape<'a> {
     kind: &'static str,
     size: [f32; 3],
     pose: Pose,
-    ghost: bool,
+    look: Look,
     moves: bool,
+    label: &'a str,
 }
 
-impl From<&Shape> for PageShape {
-    fn from(shape: &Shape) -> Self {
+impl<'a> From<&'a Shape> for PageShape<'a> {
+    fn from(shape: &'a Shape) -> Self {
         let (kind, size) = match shape.outline {
             Outline::Box { half } => ("box", half),
             Outline::Cylinder { radius, half_length } => ("cylinder", [half_length, radius, radius]),
             Outline::Tube { radius, half_length } => ("tube", [half_length, radius, radius]),
             Outline::Sphere { radius } => ("sphere", [radius; 3]),
         };
-        PageShape { kind, size, pose: shape.pose, ghost: shape.ghost, moves: shape.moves }
+        PageShape { kind, size, pose: shape.pose, look: shape.look, moves: shape.moves, label: &shape.label }
     }
 }
 
 #[derive(Serialize)]
 struct PageEpisode<'a> {
     name: &'a str,
+    task: &'a str,
+    measure: &'a str,
+    threshold: f32,
+    goal_radius: f32,
+    scene: Vec<PageShape<'a>>,
     frames: usize,
     origin: [f32; 3],
     step: f32,
@@ -582,8 +612,8 @@ mod tests {
     }
 
     fn recording(modules: usize, frames: usize) -> Recording {
-        let mut recording = Recording::new("a <title> & more", "goal-reaching", robot(modules), 1.0);
-        let mut episode = Episode::new("seed 1");
+        let mut recording = Recording::new("a <title> & more", robot(modules));
+        let mut episode = Episode::new("seed 1", Setting { goal_radius: 1.0, threshold: 1.0, ..Setting::default() });
         (0..frames).for_each(|i| episode.push(frame(modules, i as f32 * 0.05)));
         episode.event(0.1, "module 3 </script><!-- unplugged");
         recording.push(episode);
@@ -688,7 +718,11 @@ mod tests {
             let message = recording.to_html().unwrap_err().to_string();
             assert!(message.contains("frame 2 of episode \"seed 1\"") && message.contains(words), "{message}");
         }
-        let empty = Recording::new("t", "goal-reaching", robot(8), 1.0);
+        let mut recording = recording(8, 3);
+        recording.episodes[0].setting.goal_radius = -1.0;
+        let message = recording.to_html().unwrap_err().to_string();
+        assert!(message.contains("episode \"seed 1\" has a goal's radius of -1; it must be zero or more"), "{message}");
+        let empty = Recording::new("t", robot(8));
         assert!(empty.to_html().unwrap_err().to_string().contains("no episode"));
     }
 

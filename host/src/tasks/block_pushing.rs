@@ -17,7 +17,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::{Course, Gate, Point, Rules, Verdict, between, check_number, check_range, distance, either_side};
+use super::{Course, Gate, Point, Rules, Verdict, Words, between, check_number, check_range, distance, either_side};
 use crate::robot::Robot;
 use crate::sim::Snake;
 use crate::sim::scene::{Block, Scene};
@@ -99,6 +99,10 @@ impl Rules for BlockPushing {
         self.success_distance
     }
 
+    fn words(&self) -> Words {
+        Words { measure: "block to goal", done: "block at the goal", missed: "block not at the goal" }
+    }
+
     fn course(&self, seed: u64, _robot: &Robot) -> Course {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let (away, bearing) = (between(&mut rng, self.block_distance), either_side(&mut rng, self.block_bearing));
@@ -136,5 +140,64 @@ impl Rules for BlockPushing {
     fn imagined_distance(&self, course: &Course, snake: &Snake, positions: &[Point]) -> f32 {
         let behind = self.push_from(Self::block(snake), course.goal, snake.robot().link_radius);
         positions.iter().map(|p| distance(*p, behind)).sum::<f32>() / positions.len().max(1) as f32
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::soundness::Cuboid;
+    use super::*;
+
+    #[test]
+    fn block_and_goal_lie_where_they_should_and_clear_of_the_snake() {
+        let robot = Robot::default();
+        let near = BlockPushing { block_distance: [2.07, 2.3], block_bearing: 90.0, ..BlockPushing::default() };
+        for task in [BlockPushing::default(), near] {
+            task.validate(&robot).unwrap();
+            for seed in 0..300 {
+                let course = task.course(seed, &robot);
+                assert_eq!(course, task.course(seed, &robot));
+                let block = course.scene.block.unwrap();
+                let away = flat(block.position, [0.0; 3]);
+                assert!(away >= task.block_distance[0] - 1e-3 && away <= task.block_distance[1] + 1e-3, "{away}");
+                let further = flat(block.position, course.goal);
+                assert!((4.0 - 1e-3..=8.0 + 1e-3).contains(&further), "{further}");
+                let snake = Snake::in_scene(&robot, &course.scene);
+                let (position, rotation) = snake.block().unwrap();
+                let cuboid = Cuboid::new(block.half, position, rotation);
+                assert!(snake.poses().all(|(link, _)| cuboid.distance(link) >= robot.link_radius));
+                let start = task.verdict(&course, &snake, &mut Gate::default());
+                assert!(!start.success && (start.distance - further).abs() < 1e-4);
+                assert_eq!(task.point(&course, &snake, 1), Some(block.position));
+            }
+        }
+    }
+
+    #[test]
+    fn the_place_to_push_from_lies_behind_the_block() {
+        let task = BlockPushing::default();
+        let place = task.push_from([5.0, 0.0, 0.5], [9.0, 0.0, 0.5], 0.4);
+        assert!((place[0] - (5.0 - 1.0 - 0.4)).abs() < 1e-5 && place[1] == 0.0, "{place:?}");
+        // A block at its goal has no side from which to push; the place stays finite.
+        assert!(task.push_from([5.0, 0.0, 0.5], [5.0, 0.0, 0.5], 0.4).iter().all(|v| v.is_finite()));
+    }
+
+    #[test]
+    fn settings_that_cannot_be_are_refused() {
+        let default = BlockPushing::default;
+        for (bad, words) in [
+            (BlockPushing { block_size: [0.0, 1.0, 1.0], ..default() }, "an edge of block_size = 0"),
+            (BlockPushing { block_mass: 0.0, ..default() }, "block_mass = 0"),
+            (BlockPushing { block_friction: -0.1, ..default() }, "block_friction = -0.1"),
+            (BlockPushing { block_distance: [2.0, 4.0], ..default() }, "the block would stand on the snake"),
+            (BlockPushing { goal_distance: [0.5, 4.0], ..default() }, "the block would be at its goal from the start"),
+            (BlockPushing { goal_distance: [4.0, 400.0], ..default() }, "goal_distance = [4, 400]"),
+            (BlockPushing { goal_bearing: 200.0, ..default() }, "goal_bearing = 200"),
+            (BlockPushing { success_distance: f32::INFINITY, ..default() }, "success_distance = inf"),
+        ] {
+            let message = bad.validate(&Robot::default()).unwrap_err();
+            assert!(message.contains(words), "{message}");
+        }
+        assert_eq!(default().validate(&Robot::default()), Ok(()));
     }
 }

@@ -16,7 +16,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::{Course, Gate, Point, Rules, Verdict, between, distance, either_side};
+use super::{Course, Gate, Point, Rules, Verdict, Words, between, distance, either_side};
 use crate::robot::Robot;
 use crate::sim::Snake;
 
@@ -53,6 +53,10 @@ impl Rules for GoalReaching {
 
     fn goal_radius(&self) -> f32 {
         self.success_distance
+    }
+
+    fn words(&self) -> Words {
+        Words { measure: "head to goal", done: "goal reached", missed: "goal not reached" }
     }
 
     fn course(&self, seed: u64, robot: &Robot) -> Course {

@@ -121,12 +121,29 @@ pub struct Verdict {
     pub success: bool,
 }
 
+/// What people are told of a task.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Words {
+    /// What [`Verdict::distance`] is the distance of.
+    pub measure: &'static str,
+    /// Said of an episode that succeeded.
+    pub done: &'static str,
+    /// Said of one that did not.
+    pub missed: &'static str,
+}
+
 /// The settings of one task: how its scenes are drawn and what counts.
 pub trait Rules {
     /// Checks the settings for a robot; the error is a sentence.
     fn validate(&self, robot: &Robot) -> Result<(), String>;
     /// Distance that counts as success, units, where it is a ball round the goal; 0 where it is not.
     fn goal_radius(&self) -> f32;
+    /// What [`Verdict::distance`] must fall below, units; 0 where that is not what counts.
+    fn threshold(&self) -> f32 {
+        self.goal_radius()
+    }
+    /// What people are told of it.
+    fn words(&self) -> Words;
     /// The course of the episode with this seed.
     fn course(&self, seed: u64, robot: &Robot) -> Course;
     /// Point `number` of the scene in the world, as the station tells it ([`Task::observed`]).

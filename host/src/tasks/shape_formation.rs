@@ -19,7 +19,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::{Course, Gate, Point, Rules, Verdict, check_number, distance, either_side};
+use super::{Course, Gate, Point, Rules, Verdict, Words, check_number, distance, either_side};
 use crate::robot::Robot;
 use crate::sim::{Scene, Snake};
 
@@ -83,6 +83,16 @@ impl Shape {
         }
     }
 
+    /// The tightest curvature, as a multiple of the mean.
+    fn tightest(self) -> f32 {
+        match self {
+            Shape::Line | Shape::Arc | Shape::C | Shape::Ring => 1.0,
+            Shape::S => 2.0,
+            Shape::U => 3.0,
+            Shape::Spiral => 1.65,
+        }
+    }
+
     /// Share of the bend that is done at share `u` of the length, 0 to 1 both.
     fn turned(self, u: f32) -> f32 {
         match self {
@@ -130,7 +140,10 @@ impl ShapeFormation {
     fn targets(kind: Shape, seed_rng: &mut ChaCha8Rng, robot: &Robot, place: f32, heading: f32) -> Vec<Point> {
         let [least, most] = kind.bend();
         let side = if seed_rng.random() { 1.0 } else { -1.0 };
-        let bend = side * (least + (most - least) * seed_rng.random::<f32>()).to_radians();
+        let bend = (least + (most - least) * seed_rng.random::<f32>()).to_radians();
+        // A short snake cannot bend so far: no module turns by more than its yaw joints can hold.
+        let held = 0.9 * robot.torque_limit / robot.stiffness * robot.links_per_module.div_ceil(2) as f32;
+        let bend = side * bend.min(held * (robot.modules - 1) as f32 / kind.tightest());
         let spacing = robot.links_per_module as f32 * robot.link_length;
         let points = curve(kind, bend, robot.modules, spacing);
         let n = points.len() as f32;
@@ -171,6 +184,14 @@ impl Rules for ShapeFormation {
         0.0
     }
 
+    fn threshold(&self) -> f32 {
+        self.success_distance
+    }
+
+    fn words(&self) -> Words {
+        Words { measure: "modules to their targets, mean", done: "shape formed", missed: "shape not formed" }
+    }
+
     fn course(&self, seed: u64, robot: &Robot) -> Course {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let start = start_positions(robot);
@@ -201,5 +222,95 @@ impl Rules for ShapeFormation {
 
     fn imagined_distance(&self, course: &Course, _snake: &Snake, positions: &[Point]) -> f32 {
         super::wasserstein(positions, &course.marks)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn targets_are_a_modules_length_apart_and_never_within_a_body_of_each_other() {
+        for modules in (3..=16).chain([24, 32, 48, 64]) {
+            let robot = Robot { modules, ..Robot::default() };
+            let spacing = robot.links_per_module as f32 * robot.link_length;
+            for kind in Shape::ALL {
+                for seed in 0..20 {
+                    let draw =
+                        || ShapeFormation::targets(kind, &mut ChaCha8Rng::seed_from_u64(seed), &robot, 3.0, 45.0);
+                    let targets = draw();
+                    assert_eq!(targets, draw());
+                    assert_eq!(targets.len(), modules);
+                    for (i, a) in targets.iter().enumerate() {
+                        assert_eq!(a[2], robot.link_radius);
+                        for (j, b) in targets.iter().enumerate().skip(i + 1) {
+                            let apart = distance(*a, *b);
+                            // A chord of the curve is shorter than the curve.
+                            assert!(
+                                j > i + 1 || (0.75 * spacing..=1.001 * spacing).contains(&apart),
+                                "{kind:?} {modules}: {apart}"
+                            );
+                            assert!(apart > 2.0 * robot.link_radius, "{kind:?} of {modules}, {i} and {j}: {apart}");
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_curve_is_as_long_as_the_snake() {
+        for kind in Shape::ALL {
+            for bend in kind.bend().map(f32::to_radians) {
+                // Points so dense that chord and curve are the same.
+                let points = curve(kind, bend, 64, 0.1);
+                let way: f32 = points.windows(2).map(|p| libm::hypotf(p[1][0] - p[0][0], p[1][1] - p[0][1])).sum();
+                assert!((way - 6.3).abs() < 0.03, "{kind:?}: {way}");
+                let heading = |p: &[[f32; 2]]| libm::atan2f(p[1][1] - p[0][1], p[1][0] - p[0][0]);
+                let turned: Vec<f32> =
+                    points.windows(3).map(|p| libm::remainderf(heading(&p[1..]) - heading(p), 2.0 * PI)).collect();
+                let most = turned.iter().fold(0.0f32, |a, b| a.max(b.abs()));
+                assert!(most <= 1.02 * kind.tightest() * bend / 63.0 + 1e-4, "{kind:?}: {most}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_heads_target_comes_first_and_the_shape_lies_by_the_snake() {
+        let (robot, mut kinds) = (Robot::default(), 0.0f32);
+        let task = ShapeFormation { heading: 30.0, place: 2.0, ..ShapeFormation::default() };
+        let snake = Snake::new(&robot);
+        let positions: Vec<Point> = (0..8).map(|m| snake.module_position(m)).collect();
+        let middle = positions.iter().map(|p| p[0]).sum::<f32>() / 8.0;
+        for seed in 0..200 {
+            let course = task.course(seed, &robot);
+            let (head, tail) = (course.marks[0], course.marks[7]);
+            let heading = libm::atan2f(head[1] - tail[1], head[0] - tail[0]).to_degrees();
+            assert!(heading.abs() <= 30.1, "{heading}");
+            assert!(distance(course.goal, [middle, 0.0, robot.link_radius]) < 2.001);
+            let verdict = task.verdict(&course, &snake, &mut Gate::default());
+            assert!((verdict.distance * 8.0 - verdict.left).abs() < 1e-2 && verdict.paper == -verdict.left);
+            kinds = kinds.max(verdict.distance);
+            // Each module at its target is the shape formed.
+            assert_eq!(task.imagined_distance(&course, &snake, &course.marks), 0.0);
+        }
+        assert!(kinds > 3.0, "{kinds}");
+    }
+
+    #[test]
+    fn settings_that_cannot_be_are_refused() {
+        let robot = Robot::default();
+        let default = ShapeFormation::default;
+        for (bad, words) in [
+            (ShapeFormation { place: -1.0, ..default() }, "place = -1"),
+            (ShapeFormation { heading: 200.0, ..default() }, "heading = 200"),
+            (ShapeFormation { success_distance: 0.0, ..default() }, "success_distance = 0"),
+        ] {
+            let message = bad.validate(&robot).unwrap_err();
+            assert!(message.contains(words), "{message}");
+        }
+        let short = Robot { modules: 2, ..Robot::default() };
+        assert!(default().validate(&short).unwrap_err().contains("2 modules cannot form a shape"));
+        assert_eq!(default().validate(&robot), Ok(()));
     }
 }

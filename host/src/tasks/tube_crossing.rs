@@ -17,7 +17,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::{Course, Gate, Point, Rules, Verdict, between, check_number, check_range, distance, either_side};
+use super::{Course, Gate, Point, Rules, Verdict, Words, between, check_number, check_range, distance, either_side};
 use crate::robot::Robot;
 use crate::sim::Snake;
 use crate::sim::scene::{Scene, Solid};
@@ -115,6 +115,39 @@ impl TubeCrossing {
         course.marks.windows(2).map(|ends| distance(ends[0], ends[1])).sum()
     }
 
+    /// What a head at `p` makes of the gate. Who slips in from behind has not crossed the tube, wherever it comes out.
+    fn passage(&self, course: &Course, p: Point, gate: Gate) -> Gate {
+        let (place, length) = (self.place(course, p), Self::length(course));
+        let inside = place.within && (0.0..=length).contains(&place.along);
+        match gate {
+            Gate::Before if inside && place.along < 0.5 * length => Gate::Inside,
+            Gate::Before if inside => Gate::Astray,
+            Gate::Inside | Gate::Astray if inside => gate,
+            Gate::Inside if place.along > length => Gate::Passed,
+            Gate::Passed => Gate::Passed,
+            _ => Gate::Before,
+        }
+    }
+
+    /// Whether the front edges of the walls stand clear of the snake at the start, however the entrance lies and points.
+    fn clear_of_start(&self, robot: &Robot) -> bool {
+        let front = 0.5 * robot.link_length + robot.link_radius;
+        let most = self.entrance_bearing.to_radians();
+        let shares = (0..=8).map(|k| k as f32 / 8.0);
+        let angles = || shares.clone().map(move |s| most * (2.0 * s - 1.0));
+        angles().flat_map(|bearing| angles().map(move |turn| (bearing, bearing + turn))).all(|(bearing, heading)| {
+            let ((by, bx), (sin, cos)) = (libm::sincosf(bearing), libm::sincosf(heading));
+            [1.0f32, -1.0].into_iter().all(|side| {
+                shares.clone().all(|s| {
+                    let aside = side * (0.5 * self.tube_width + s * THICKNESS);
+                    let x = self.entrance_distance[0] * bx - aside * sin;
+                    let y = self.entrance_distance[0] * by + aside * cos;
+                    x > front || y.abs() > robot.link_radius
+                })
+            })
+        })
+    }
+
     /// The way to the goal of a point that has passed the tube, is in it, or has it before it.
     fn left(&self, course: &Course, p: Point, gate: Gate) -> f32 {
         match gate {
@@ -201,6 +234,12 @@ impl Rules for TubeCrossing {
         check_range("entrance_distance", self.entrance_distance, [clear, 50.0])
             .map_err(|e| format!("{e}: nearer, the tube would stand on the snake"))?;
         check_number("entrance_bearing", self.entrance_bearing, [0.0, 45.0])?;
+        if !self.clear_of_start(robot) {
+            return Err(format!(
+                "entrance_distance = {:?} with entrance_bearing = {}: the tube would stand on the snake; a larger distance or a smaller bearing keeps it clear",
+                self.entrance_distance, self.entrance_bearing
+            ));
+        }
         check_number("success_distance", self.success_distance, [0.01, 100.0])?;
         check_number("goal_beyond", self.goal_beyond, [self.success_distance, 50.0])
             .map_err(|e| format!("{e}: nearer, the goal would be reached inside the tube"))
@@ -208,6 +247,14 @@ impl Rules for TubeCrossing {
 
     fn goal_radius(&self) -> f32 {
         self.success_distance
+    }
+
+    fn words(&self) -> Words {
+        Words {
+            measure: "head to goal",
+            done: "through the tube to the goal",
+            missed: "not through the tube to the goal",
+        }
     }
 
     fn course(&self, seed: u64, robot: &Robot) -> Course {
@@ -242,22 +289,7 @@ impl Rules for TubeCrossing {
 
     fn verdict(&self, course: &Course, snake: &Snake, gate: &mut Gate) -> Verdict {
         let head = snake.head();
-        let (place, length) = (self.place(course, head), Self::length(course));
-        let inside = place.within && (0.0..=length).contains(&place.along);
-        *gate = match *gate {
-            // Who slips in from behind has not crossed it, wherever it comes out.
-            Gate::Before if inside => {
-                if place.along < 0.5 * length {
-                    Gate::Inside
-                } else {
-                    Gate::Astray
-                }
-            }
-            Gate::Inside | Gate::Astray if inside => *gate,
-            Gate::Inside if place.along > length => Gate::Passed,
-            Gate::Passed => Gate::Passed,
-            _ => Gate::Before,
-        };
+        *gate = self.passage(course, head, *gate);
         let to_goal = distance(head, course.goal);
         let to_tube = if matches!(gate, Gate::Before | Gate::Astray) { distance(head, course.marks[0]) } else { 0.0 };
         Verdict {
@@ -280,5 +312,220 @@ impl Rules for TubeCrossing {
             self.left(course, *p, gate)
         });
         left.sum::<f32>() / positions.len().max(1) as f32
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::soundness::Cuboid;
+    use super::super::{Judge, TaskConfig};
+    use super::*;
+    use composer_shared::policy::Task;
+
+    fn task(bend: f32) -> TubeCrossing {
+        TubeCrossing { tube_bend: bend, entrance_bearing: 0.0, ..TubeCrossing::default() }
+    }
+
+    fn panels(course: &Course) -> Vec<Cuboid> {
+        course.scene.solids.iter().map(|s| Cuboid::new(s.half, s.position, s.rotation())).collect()
+    }
+
+    /// A point `along` the centre line, `aside` to its left and at height `z`.
+    fn at(course: &Course, along: f32, aside: f32, z: f32) -> Point {
+        let piece = TubeCrossing::length(course) / PIECES as f32;
+        let k = ((along / piece).floor().max(0.0) as usize).min(PIECES - 1);
+        let (a, b) = (course.marks[k], course.marks[k + 1]);
+        let axis = [(b[0] - a[0]) / piece, (b[1] - a[1]) / piece];
+        let s = along - k as f32 * piece;
+        [a[0] + axis[0] * s - axis[1] * aside, a[1] + axis[1] * s + axis[0] * aside, z]
+    }
+
+    #[test]
+    fn a_point_is_placed_along_and_within_the_tube() {
+        let robot = Robot::default();
+        for bend in [0.0, 45.0, 90.0] {
+            let task = task(bend);
+            for seed in 0..20 {
+                let course = task.course(seed, &robot);
+                let length = TubeCrossing::length(&course);
+                assert!((8.0..=12.0).contains(&length), "{length}");
+                let near = |p: Point, along: f32, within: bool| {
+                    let place = task.place(&course, p);
+                    // Beside a bend the next piece may be the nearer one.
+                    assert!(
+                        (place.along - along).abs() < 0.8 && place.within == within,
+                        "{p:?}: {place:?}, not {along}"
+                    );
+                };
+                near(at(&course, -2.0, 0.0, 0.4), -2.0, true);
+                near(at(&course, length + 2.0, 0.0, 0.4), length + 2.0, true);
+                for share in [0.02f32, 0.3, 0.5, 0.8, 0.98] {
+                    for aside in [-1.0f32, -0.5, 0.0, 0.5, 1.0] {
+                        near(at(&course, share * length, aside, 0.4), share * length, true);
+                        near(at(&course, share * length, aside, 2.5), share * length, false);
+                    }
+                    near(at(&course, share * length, 1.8, 0.4), share * length, false);
+                    near(at(&course, share * length, -1.8, 0.4), share * length, false);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_panels_are_closed_and_leave_the_inside_free() {
+        let robot = Robot::default();
+        for (bend, width, height) in
+            [(0.0, 2.4, 2.0), (45.0, 2.4, 2.0), (90.0, 2.4, 2.0), (180.0, 1.6, 1.2), (90.0, 1.2, 3.0)]
+        {
+            let task = TubeCrossing { tube_width: width, tube_height: height, ..task(bend) };
+            task.validate(&robot).unwrap();
+            let bevel = BEVEL * width.min(height);
+            for seed in 0..3 {
+                let course = task.course(seed, &robot);
+                let (panels, length) = (panels(&course), TubeCrossing::length(&course));
+                let in_panel = |p: Point, by: f32| panels.iter().any(|panel| panel.depth(p) > by);
+                for step in 0..=160 {
+                    let along = 0.01 + step as f32 / 160.0 * (length - 0.02);
+                    // From the centre line outwards in every direction across the tube: free, then a panel of full thickness.
+                    for angle in (0..=24).map(|k| PI * k as f32 / 24.0) {
+                        let (up, out) = libm::sincosf(angle);
+                        let ray = |reach: f32| at(&course, along, reach * out, 0.2 + reach * up);
+                        let walls = 0.5 * width / out.abs().max(1e-6);
+                        let roof = (height - 0.2) / up.max(1e-6);
+                        let slopes = (0.5 * width + height - bevel - 0.2) / (out.abs() + up);
+                        let face = walls.min(roof).min(slopes);
+                        // A bend's inside is the nearer the more it turns in a piece.
+                        let inner = face * (1.0 - 0.15 * (bend / 180.0)) - 0.02;
+                        let free = (0..50).all(|k| !in_panel(ray(inner * k as f32 / 50.0), 0.0));
+                        assert!(
+                            free,
+                            "seed {seed}, bend {bend}: a panel stands inside at {along} of {length}, angle {angle}"
+                        );
+                        let closed = (0..40).any(|k| in_panel(ray(face * 1.01 + 0.02 * k as f32), -1e-4));
+                        assert!(closed, "seed {seed}, bend {bend}: a gap at {along} of {length}, angle {angle}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_tube_never_stands_on_the_snake() {
+        let robot = Robot::default();
+        let body: Vec<Point> = (-9..640).map(|k| [-0.025 * k as f32, 0.0, robot.link_radius]).collect();
+        let mut refused = 0;
+        for seed in 0..300u64 {
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            let mut draw = |range| between(&mut rng, range);
+            let task = if seed < 50 {
+                TubeCrossing::default()
+            } else {
+                let nearest = draw([0.65, 1.2]);
+                TubeCrossing {
+                    tube_width: draw([1.0, 3.0]),
+                    tube_length: [12.6, 14.0],
+                    tube_bend: draw([0.0, 180.0]),
+                    entrance_distance: [nearest, nearest + 0.2],
+                    entrance_bearing: draw([0.0, 45.0]),
+                    ..TubeCrossing::default()
+                }
+            };
+            if task.validate(&robot).is_err() {
+                refused += 1;
+                continue;
+            }
+            for course in 0..10 {
+                let panels = panels(&task.course(100 * seed + course, &robot));
+                for panel in &panels {
+                    assert!(body.iter().all(|p| panel.distance(*p) > 0.99 * robot.link_radius), "{task:?}");
+                }
+            }
+        }
+        assert!((10..150).contains(&refused), "{refused} refused");
+    }
+
+    #[test]
+    fn only_the_way_through_from_the_front_counts() {
+        let task = task(45.0);
+        let course = task.course(3, &Robot::default());
+        let length = TubeCrossing::length(&course);
+        // The gate after a way along (along, aside, z), in steps of a tenth of a unit.
+        let walk = |way: &[[f32; 3]]| {
+            let mut gate = Gate::Before;
+            for ends in way.windows(2) {
+                let steps = (10.0 * distance(ends[0], ends[1])).ceil() as usize;
+                for step in 0..=steps {
+                    let share = step as f32 / steps as f32;
+                    let [along, aside, z] = [0, 1, 2].map(|i| ends[0][i] + share * (ends[1][i] - ends[0][i]));
+                    gate = task.passage(&course, at(&course, along, aside, z), gate);
+                }
+            }
+            gate
+        };
+        let behind = length + 3.0;
+        assert_eq!(walk(&[[-2.0, 0.0, 0.4], [behind, 0.0, 0.4]]), Gate::Passed);
+        assert_eq!(walk(&[[-2.0, 0.0, 0.4], [0.6 * length, 0.5, 1.0]]), Gate::Inside);
+        // In and out again; round it; over it.
+        assert_eq!(walk(&[[-2.0, 0.0, 0.4], [0.6 * length, 0.0, 0.4], [-2.0, 0.0, 0.4]]), Gate::Before);
+        assert_eq!(walk(&[[-2.0, 0.0, 0.4], [-1.0, 3.0, 0.4], [behind, 3.0, 0.4], [behind, 0.0, 0.4]]), Gate::Before);
+        assert_eq!(walk(&[[-2.0, 0.0, 0.4], [-1.0, 0.0, 3.0], [behind, 0.0, 3.0], [behind, 0.0, 0.4]]), Gate::Before);
+        // Round it, in from behind, up to its front and back out.
+        let round = [[-1.0, 3.0, 0.4], [behind, 3.0, 0.4], [behind, 0.0, 0.4], [0.1 * length, 0.0, 0.4]];
+        assert_eq!(walk(&round), Gate::Astray);
+        assert_eq!(walk(&[&round[..], &[[behind, 0.0, 0.4]]].concat()), Gate::Before);
+        assert_eq!(walk(&[&round[..], &[[-1.0, 0.0, 0.4]]].concat()), Gate::Before);
+    }
+
+    #[test]
+    fn a_wave_drives_the_snake_through_a_straight_tube() {
+        let robot = Robot::default();
+        let mut config = TaskConfig::new(Task::TubeCrossing);
+        config.rules.tube_crossing = TubeCrossing { tube_length: [8.0, 8.0], ..task(0.0) };
+        let (mut snake, mut judge) = Judge::start(&config, 1, &robot);
+        let mut left = judge.verdict().left;
+        for step in 0..400 {
+            for module in 0..robot.modules {
+                let wave = libm::sinf(2.0 * PI * 0.5 * 0.05 * step as f32 - 1.3 * module as f32);
+                snake.set_torque(module, [0.5 * robot.torque_limit * wave, 0.0]);
+            }
+            for _ in 0..5 {
+                snake.step();
+                judge.watch(&config, &snake);
+            }
+            judge.step(&config, &snake);
+            assert!(judge.verdict().left < left + 1.0, "the way left jumps from {left} to {}", judge.verdict().left);
+            left = judge.verdict().left;
+            if judge.verdict().success {
+                return;
+            }
+        }
+        panic!("the snake is stuck: {:?}, head at {:?}", judge.verdict(), snake.head());
+    }
+
+    #[test]
+    fn settings_that_cannot_be_are_refused() {
+        let default = TubeCrossing::default;
+        for (bad, words) in [
+            (TubeCrossing { tube_width: 0.7, ..default() }, "tube_width = 0.7; it must be from 1"),
+            (TubeCrossing { tube_height: 0.8, ..default() }, "tube_height = 0.8; it must be from 1"),
+            (TubeCrossing { tube_length: [5.0, 4.0], ..default() }, "tube_length = [5, 4]"),
+            (
+                TubeCrossing { tube_length: [2.0, 4.0], tube_bend: 180.0, ..default() },
+                "bends with a radius of 0.6 units",
+            ),
+            (TubeCrossing { tube_bend: f32::NAN, ..default() }, "tube_bend = NaN"),
+            (TubeCrossing { entrance_distance: [0.2, 1.0], ..default() }, "the tube would stand on the snake"),
+            (
+                TubeCrossing { tube_width: 1.0, entrance_distance: [0.7, 1.0], entrance_bearing: 45.0, ..default() },
+                "a smaller bearing keeps it clear",
+            ),
+            (TubeCrossing { goal_beyond: 1.0, ..default() }, "reached inside the tube"),
+            (TubeCrossing { goal_beyond: 60.0, ..default() }, "goal_beyond = 60"),
+            (TubeCrossing { success_distance: 0.0, ..default() }, "success_distance = 0"),
+        ] {
+            let message = bad.validate(&Robot::default()).unwrap_err();
+            assert!(message.contains(words), "{message}");
+        }
+        assert_eq!(default().validate(&Robot::default()), Ok(()));
     }
 }

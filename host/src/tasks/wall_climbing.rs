@@ -15,7 +15,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::{Course, Gate, Point, Rules, Verdict, between, check_number, check_range, either_side};
+use super::{Course, Gate, Point, Rules, Verdict, Words, between, check_number, check_range, either_side};
 use crate::robot::Robot;
 use crate::sim::Snake;
 use crate::sim::scene::{Scene, Solid};
@@ -102,6 +102,10 @@ impl Rules for WallClimbing {
         0.0
     }
 
+    fn words(&self) -> Words {
+        Words { measure: "tail to the far side of the wall", done: "over the wall", missed: "not over the wall" }
+    }
+
     fn course(&self, seed: u64, robot: &Robot) -> Course {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let (height, away) = (between(&mut rng, self.wall_height), between(&mut rng, self.wall_distance));
@@ -155,5 +159,116 @@ impl Rules for WallClimbing {
             wall.left(*p, robot.link_radius, (count - m) as f32 * module)
         });
         left.sum::<f32>() / count.max(1) as f32
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The course with a wall of this height at this distance, across.
+    fn course(height: f32, near: f32) -> Course {
+        let solid = Solid {
+            half: [0.5, HALF_LENGTH, 0.5 * height],
+            position: [near + 0.5, 0.0, 0.5 * height],
+            yaw: 0.0,
+            roll: 0.0,
+        };
+        Course { scene: Scene { solids: vec![solid], block: None }, ..Course::default() }
+    }
+
+    #[test]
+    fn what_is_left_falls_all_the_way_over_the_wall() {
+        let task = WallClimbing::default();
+        for seed in 0..20 {
+            let course = task.course(seed, &Robot::default());
+            let (wall, radius) = (Wall::of(&course), 0.4);
+            let (far, top) = (wall.near + wall.thickness, wall.height + radius);
+            // To the foot, up the face, round the edge, across, round the other edge, down, and on.
+            let arc = |corner: f32, from: f32, to: f32| -> Vec<[f32; 2]> {
+                (0..=20)
+                    .map(|k| libm::sincosf(from + (to - from) * k as f32 / 20.0))
+                    .map(|(sin, cos)| [corner + radius * cos, wall.height + radius * sin])
+                    .collect()
+            };
+            let (quarter, half) = (std::f32::consts::FRAC_PI_2, std::f32::consts::PI);
+            let line = |a: [f32; 2], b: [f32; 2]| -> Vec<[f32; 2]> {
+                (0..=40)
+                    .map(|k| k as f32 / 40.0)
+                    .map(|s| [a[0] + s * (b[0] - a[0]), a[1] + s * (b[1] - a[1])])
+                    .collect()
+            };
+            let way = [
+                line([wall.near - 6.0, radius], [wall.near - radius, radius]),
+                line([wall.near - radius, radius], [wall.near - radius, wall.height]),
+                arc(wall.near, half, quarter),
+                line([wall.near, top], [far, top]),
+                arc(far, quarter, 0.0),
+                line([far + radius, wall.height], [far + radius, radius]),
+                line([far + radius, radius], [far + 2.0, radius]),
+            ]
+            .concat();
+            let left: Vec<f32> = way
+                .iter()
+                .map(|[along, z]| [along * wall.normal[0], along * wall.normal[1], *z])
+                .map(|p| wall.left(p, radius, 2.0))
+                .collect();
+            for (k, pair) in left.windows(2).enumerate() {
+                assert!(pair[1] <= pair[0] + 1e-4, "seed {seed}: rises at {:?}: {pair:?}", way[k + 1]);
+            }
+            assert!(left[0] > wall.height + 6.0 && left[left.len() - 1].abs() < 1e-3, "{left:?}");
+        }
+    }
+
+    #[test]
+    fn success_is_the_tail_behind_the_wall() {
+        let robot = Robot::default();
+        // The snake lies from 0 to -15.5.
+        let snake = Snake::new(&robot);
+        let verdict = |near: f32| WallClimbing::default().verdict(&course(1.2, near), &snake, &mut Gate::default());
+        assert!(!verdict(2.0).success && !verdict(-1.0).success && !verdict(-8.0).success && !verdict(-16.0).success);
+        assert!(verdict(-16.6).success);
+        assert!((verdict(-8.0).distance - 8.5).abs() < 1e-3 && verdict(-16.6).distance == 0.0);
+        assert!(verdict(2.0).left > verdict(-1.0).left && verdict(-1.0).left > verdict(-8.0).left);
+        assert!(verdict(-17.6).left < 1.0, "{:?}", verdict(-17.6));
+    }
+
+    #[test]
+    fn the_wall_stands_where_it_should_and_is_too_long_to_go_round() {
+        let (task, robot) = (WallClimbing::default(), Robot::default());
+        for seed in 0..200 {
+            let course = task.course(seed, &robot);
+            let wall = Wall::of(&course);
+            assert!(
+                (1.0..=1.6).contains(&wall.height) && (1.999..=5.001).contains(&wall.near),
+                "{} {}",
+                wall.height,
+                wall.near
+            );
+            assert!(wall.along(course.goal) > wall.near + wall.thickness + 16.0);
+            let snake = Snake::in_scene(&robot, &course.scene);
+            assert_eq!(task.point(&course, &snake, 0), Some(course.goal));
+            let foot = task.point(&course, &snake, 1).unwrap();
+            assert!((wall.along(foot) - wall.near).abs() < 1e-4 && foot[2] == 0.0);
+            assert_eq!(task.point(&course, &snake, 2).unwrap()[2], wall.height);
+            assert!(wall.along([0.25, 0.0, 0.4]) + robot.link_radius <= wall.near);
+        }
+    }
+
+    #[test]
+    fn settings_that_cannot_be_are_refused() {
+        let default = WallClimbing::default;
+        for (bad, words) in [
+            (WallClimbing { wall_height: [0.5, 1.0], ..default() }, "a wall is higher than the snake, 0.8 units"),
+            (WallClimbing { wall_height: [2.0, 1.0], ..default() }, "the smaller first"),
+            (WallClimbing { wall_thickness: -1.0, ..default() }, "wall_thickness = -1; it must be from 0.5 to 20"),
+            (WallClimbing { wall_thickness: f32::NAN, ..default() }, "wall_thickness = NaN"),
+            (WallClimbing { wall_distance: [0.1, 2.0], ..default() }, "the wall would stand on the snake"),
+            (WallClimbing { wall_bearing: 90.0, ..default() }, "wall_bearing = 90"),
+        ] {
+            let message = bad.validate(&Robot::default()).unwrap_err();
+            assert!(message.contains(words), "{message}");
+        }
+        assert_eq!(default().validate(&Robot::default()), Ok(()));
     }
 }
