@@ -6,6 +6,7 @@
 
 use nalgebra::{Matrix3, Vector3};
 
+use crate::math;
 use crate::robot::{DEAD_AFTER, Geometry, MAX_JOINTS, MAX_MODULES};
 
 /// A rotation and a translation: `point_in_a = rotation * point_in_b + position`.
@@ -85,18 +86,25 @@ impl Chain {
         let links = usize::from(self.geometry.links_per_module).clamp(1, MAX_JOINTS);
         let half = 0.5 * self.geometry.link_length;
         let mut pose = Pose::identity();
-        let joints = self.angles.iter().flat_map(|module| module.iter().take(links).enumerate());
-        for (k, &angle) in joints.take(link) {
-            pose.position -= pose.rotation.column(0) * half;
-            let (sin, cos) = libm::sincosf(angle);
-            turn(&mut pose.rotation, k % 2, sin, cos);
-            pose.position -= pose.rotation.column(0) * half;
+        let mut left = link;
+        for module in &self.angles {
+            for (k, &angle) in module.iter().take(links).enumerate() {
+                if left == 0 {
+                    return pose;
+                }
+                left -= 1;
+                pose.position -= pose.rotation.column(0) * half;
+                let (sin, cos) = math::sin_cos(angle);
+                turn(&mut pose.rotation, k % 2, sin, cos);
+                pose.position -= pose.rotation.column(0) * half;
+            }
         }
         pose
     }
 }
 
 /// `rotation * R`, where R turns about z (axis 0, yaw) or y (axis 1, pitch).
+#[inline(always)]
 fn turn(rotation: &mut Matrix3<f32>, axis: usize, sin: f32, cos: f32) {
     let x = rotation.column(0).into_owned();
     if axis == 0 {

@@ -1,5 +1,5 @@
 #![no_std]
-#![forbid(unsafe_code)]
+#![deny(unsafe_code)]
 //! What the firmware of a snake module and the host that trains it must agree on, written once.
 //!
 //! No I/O, no allocation, no operating system. Lengths are in *robot units* (SomoGym's scale, see [`robot`]), angles in
@@ -9,6 +9,7 @@
 extern crate std;
 
 pub mod kinematics;
+pub mod math;
 pub mod nn;
 pub mod observation;
 pub mod policies;

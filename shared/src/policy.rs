@@ -586,18 +586,14 @@ impl<'a> Policy<'a> {
         for ((x, value), (mean, gain)) in input.iter_mut().zip(observation).zip(self.mean.iter().zip(self.gain)) {
             *x = nn::quantise(*value, f32::from_le_bytes(*mean), f32::from_le_bytes(*gain));
         }
-        let embedding = self.encoder.forward(&input).map(nn::tanh);
-        if !self.meta.attention {
-            return Encoded { embedding, query: [0; KEY], latent: Latent::ZERO };
+        let mut encoded = Encoded { embedding: [0; EMBED], query: [0; KEY], latent: Latent::ZERO };
+        self.encoder.forward_to(&input, &mut encoded.embedding, nn::tanh);
+        if self.meta.attention {
+            self.query.forward_to(&encoded.embedding, &mut encoded.query, nn::saturate16);
+            self.key.forward_to(&encoded.embedding, &mut encoded.latent.key, nn::saturate8);
+            self.value.forward_to(&encoded.embedding, &mut encoded.latent.value, nn::saturate8);
         }
-        Encoded {
-            query: self.query.forward(&embedding).map(nn::saturate16),
-            latent: Latent {
-                key: self.key.forward(&embedding).map(nn::saturate8),
-                value: self.value.forward(&embedding).map(nn::saturate8),
-            },
-            embedding,
-        }
+        encoded
     }
 
     /// The action of a module, yaw and pitch torque as a fraction of the limit, each within -1 to 1.
@@ -615,28 +611,13 @@ impl<'a> Policy<'a> {
         own_index: usize,
     ) -> [f32; AXES] {
         let own_index = own_index.min(MAX_MODULES - 1);
-        let own_bit = 1u64 << own_index;
-        let mut hidden = self.hidden.forward(&own.embedding);
+        let mut hidden = [0; HIDDEN];
+        self.hidden.forward(&own.embedding, &mut hidden);
         if self.meta.attention {
-            let mask = heard | own_bit;
-            let latent = |j: usize| if j == own_index { &own.latent } else { latents.get(j).unwrap_or(&Latent::ZERO) };
-            let mut logits = [0; MAX_MODULES];
-            for j in nn::ones(mask) {
-                if let Some(logit) = logits.get_mut(j) {
-                    *logit = dot(&own.query, &latent(j).key);
-                }
-            }
-            let weights = nn::softmax(&logits, mask, self.softmax.0, self.softmax.1);
-            // |sum| <= 128 * (32767 + 32), far from overflow.
-            let mut sums = [0i32; VALUE];
-            for j in nn::ones(mask) {
-                let weight = weights.get(j).map_or(0, |w| i32::from(*w));
-                for (sum, value) in sums.iter_mut().zip(latent(j).value) {
-                    *sum += weight * i32::from(value);
-                }
-            }
-            let context = sums.map(|sum| nn::saturate16((sum + (1 << (CONTEXT_SHIFT - 1))) >> CONTEXT_SHIFT));
-            for (sum, more) in hidden.iter_mut().zip(self.context.forward(&context)) {
+            let (context, weights) = self.attend(own, latents, heard, own_index);
+            let mut more = [0; HIDDEN];
+            self.context.forward(&context, &mut more);
+            for (sum, more) in hidden.iter_mut().zip(more) {
                 *sum = sum.saturating_add(more);
             }
             if let Some(attention) = attention {
@@ -648,18 +629,55 @@ impl<'a> Policy<'a> {
                 *weight = nn::ONE as u16;
             }
         }
-        self.output.forward(&hidden.map(nn::tanh)).map(|action| f32::from(nn::saturate16(action)) / f32::from(nn::ONE))
+        let mut activations = [0; HIDDEN];
+        for (activation, sum) in activations.iter_mut().zip(hidden) {
+            *activation = nn::tanh(sum);
+        }
+        let mut action = [0; OUT];
+        self.output.forward_to(&activations, &mut action, nn::saturate16);
+        action.map(|action| f32::from(action) / f32::from(nn::ONE))
+    }
+
+    /// The attention of [`Policy::act`] alone: the context, in steps of 2^-8 of an int8 value, and the weight of each module in Q15.
+    /// A policy without attention does not use it.
+    pub fn attend(
+        &self,
+        own: &Encoded,
+        latents: &[Latent; MAX_MODULES],
+        heard: u64,
+        own_index: usize,
+    ) -> ([i16; VALUE], [u16; MAX_MODULES]) {
+        let own_index = own_index.min(MAX_MODULES - 1);
+        let mask = heard | 1u64 << own_index;
+        let latent = |j: usize| if j == own_index { &own.latent } else { latents.get(j).unwrap_or(&Latent::ZERO) };
+        let mut logits = [0; MAX_MODULES];
+        let query = nn::Query::new(&own.query);
+        for j in nn::ones(mask) {
+            if let Some(logit) = logits.get_mut(j) {
+                *logit = query.dot(&latent(j).key);
+            }
+        }
+        let weights = nn::softmax(&logits, mask, self.softmax.0, self.softmax.1);
+        // |sum| <= 128 * (32767 + 32), far from overflow.
+        let mut sums = [0; VALUE];
+        let mut modules = nn::ones(mask);
+        let weight = |j: usize| weights.get(j).map_or(0, |w| *w as i16);
+        while let Some(j) = modules.next() {
+            // Two at a time; the last of an odd number with nobody.
+            let (other, other_weight) = modules.next().map_or((j, 0), |other| (other, weight(other)));
+            nn::add_weighted(&mut sums, [weight(j), other_weight], [&latent(j).value, &latent(other).value]);
+        }
+        let mut context = [0; VALUE];
+        for (context, sum) in context.iter_mut().zip(sums) {
+            *context = nn::saturate16((sum + (1 << (CONTEXT_SHIFT - 1))) >> CONTEXT_SHIFT);
+        }
+        (context, weights)
     }
 }
 
 /// The context is the weighted sum of values (Q15 weights times int8), shifted right by this: int8 value 1 becomes
 /// about 256.
 pub const CONTEXT_SHIFT: u32 = 7;
-
-/// |result| <= 16 * 32767 * 128, below 2^27.
-fn dot(query: &[i16; KEY], key: &[i8; KEY]) -> i32 {
-    query.iter().zip(key).map(|(&q, &k)| i32::from(q) * i32::from(k)).sum()
-}
 
 fn check_input(mean: f32, gain: f32) -> Result<(), PolicyError> {
     if !(-1e6..=1e6).contains(&mean) {
