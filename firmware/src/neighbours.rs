@@ -33,6 +33,7 @@ struct Assembly {
 #[derive(Clone, Debug)]
 pub struct Neighbours {
     others: u64,
+    modules: u8,
     dead_after: u8,
     policy: u16,
     /// The current cycle; none before the first.
@@ -47,10 +48,10 @@ pub struct Neighbours {
     /// The latent may be attended to: plausible, and of the same policy.
     usable: u64,
     mismatch: u64,
-    /// Cycles without any frame, without STATE, without LATENT.
-    silent: [u8; MAX_MODULES],
-    silent_state: [u8; MAX_MODULES],
-    silent_latent: [u8; MAX_MODULES],
+    /// Silent without any frame, without STATE, without LATENT.
+    silence: Silence,
+    silence_state: Silence,
+    silence_latent: Silence,
     states: [State; MAX_MODULES],
     latents: [Latent; MAX_MODULES],
     assemblies: [Assembly; MAX_MODULES],
@@ -71,6 +72,7 @@ impl Neighbours {
     pub fn new(own: u8, modules: u8, dead_after: u8, policy: u16) -> Self {
         Neighbours {
             others: first(modules) & !bit(own),
+            modules,
             dead_after: dead_after.max(1),
             policy,
             cycle: None,
@@ -81,21 +83,21 @@ impl Neighbours {
             latent_next: 0,
             usable: 0,
             mismatch: 0,
-            silent: [0; MAX_MODULES],
-            silent_state: [0; MAX_MODULES],
-            silent_latent: [0; MAX_MODULES],
+            silence: Silence::NONE,
+            silence_state: Silence::NONE,
+            silence_latent: Silence::NONE,
             states: [State::new(0, Health(0), &[0.0; 4]); MAX_MODULES],
             latents: [Latent::default(); MAX_MODULES],
             assemblies: [Assembly { data: [[0; 7]; FRAGMENTS], pieces: 0, cycle4: 0 }; MAX_MODULES],
         }
     }
 
-    /// A control cycle starts: who was not heard in the last one has been silent for one more. Cost: one pass over [`MAX_MODULES`].
+    /// A control cycle starts: who was not heard in the last one has been silent for one more. Cost: one pass over the modules.
     pub fn start(&mut self, cycle: u8) {
         let follows = self.cycle.is_none_or(|last| last.wrapping_add(1) == cycle);
-        count(&mut self.silent, self.heard);
-        count(&mut self.silent_state, self.state_now);
-        count(&mut self.silent_latent, self.latent_now);
+        self.silence.count(self.heard, self.modules, self.dead_after);
+        self.silence_state.count(self.state_now, self.modules, self.dead_after);
+        self.silence_latent.count(self.latent_now, self.modules, self.dead_after);
         self.heard = 0;
         self.state_now = if follows { self.state_next } else { 0 };
         self.latent_now = if follows { self.latent_next } else { 0 };
@@ -103,7 +105,7 @@ impl Neighbours {
         (self.state_next, self.latent_next) = (0, 0);
         self.cycle = Some(cycle);
         self.mismatch &= self.alive();
-        for assembly in &mut self.assemblies {
+        for assembly in self.assemblies.iter_mut().take(usize::from(self.modules)) {
             // Pieces of older cycles must not meet those of a later cycle with the same lower 4 bits.
             if assembly.cycle4 != cycle & 15 {
                 assembly.pieces = 0;
@@ -208,7 +210,7 @@ impl Neighbours {
 
     /// Neighbours that were heard within the last `dead_after` cycles.
     pub fn alive(&self) -> u64 {
-        self.others & (self.heard | self.less_silent(&self.silent))
+        self.others & (self.heard | self.silence.shorter)
     }
 
     /// Live neighbours that run another policy.
@@ -218,12 +220,12 @@ impl Neighbours {
 
     /// Live neighbours whose STATE of this cycle has not come.
     pub fn missing_states(&self) -> u64 {
-        self.others & self.less_silent(&self.silent_state) & !(self.state_now | self.state_next)
+        self.others & self.silence_state.shorter & !(self.state_now | self.state_next)
     }
 
     /// Live neighbours whose LATENT of this cycle has not come.
     pub fn missing_latents(&self) -> u64 {
-        self.others & (self.less_silent(&self.silent_latent) | self.state_now) & !(self.latent_now | self.latent_next)
+        self.others & (self.silence_latent.shorter | self.state_now) & !(self.latent_now | self.latent_next)
     }
 
     /// Neighbours whose latent of this cycle may be attended to.
@@ -246,16 +248,29 @@ impl Neighbours {
     pub fn next_cycle_seen(&self) -> bool {
         self.state_next | self.latent_next != 0
     }
-
-    fn less_silent(&self, silent: &[u8; MAX_MODULES]) -> u64 {
-        // From the last module down, so that module 0 ends at bit 0.
-        silent.iter().rev().fold(0, |mask, &s| mask << 1 | u64::from(s < self.dead_after))
-    }
 }
 
-fn count(silent: &mut [u8; MAX_MODULES], heard: u64) {
-    for (module, silent) in silent.iter_mut().enumerate() {
-        *silent = if heard >> module & 1 != 0 { 0 } else { silent.saturating_add(1) };
+/// For how many cycles each module has been silent in some way.
+#[derive(Clone, Debug)]
+struct Silence {
+    cycles: [u8; MAX_MODULES],
+    /// Those that were silent for less than `dead_after` cycles. Kept, because it is asked for with every frame.
+    shorter: u64,
+}
+
+impl Silence {
+    const NONE: Silence = Silence { cycles: [0; MAX_MODULES], shorter: u64::MAX };
+
+    /// One more cycle, in which `heard` were not silent.
+    fn count(&mut self, heard: u64, modules: u8, dead_after: u8) {
+        self.shorter = 0;
+        for (module, cycles) in self.cycles.iter_mut().enumerate().take(usize::from(modules)) {
+            let bit = 1 << module;
+            *cycles = if heard & bit != 0 { 0 } else { cycles.saturating_add(1) };
+            if *cycles < dead_after {
+                self.shorter |= bit;
+            }
+        }
     }
 }
 
