@@ -1,0 +1,264 @@
+//! Counts instructions on the emulated Cortex-M4F, part by part; `snakectl bench firmware` runs it and prints the table.
+//!
+//! Under `qemu-system-arm -M mps2-an386 -icount shift=0` an instruction takes one nanosecond of virtual time, and SysTick counts the
+//! board's 25 MHz, so a tick is 40 instructions. Work is repeated until that resolution does not matter, and the loop's own instructions
+//! are subtracted. What is printed, one line each, `name = instructions`:
+//!
+//!     calibration = 1000          (a thousand NOPs)
+//!     control_step/8/mean = ...
+#![no_std]
+#![no_main]
+
+use core::hint::black_box;
+
+use composer_firmware::controller::{BusKind, Config, Controller};
+use composer_firmware::failsafe::BusStatus;
+use composer_shared::kinematics::Chain;
+use composer_shared::nn::Dense;
+use composer_shared::observation::{Sensors, observe};
+use composer_shared::policies;
+use composer_shared::policy::{Latent, Policy};
+use composer_shared::robot::{Geometry, MAX_MODULES};
+use composer_shared::wire::{Frame, Goal, Health, LatentMessage, Message, STATION, State, Sync};
+use cortex_m::peripheral::SYST;
+use cortex_m::peripheral::syst::SystClkSource;
+use cortex_m_rt::entry;
+use cortex_m_semihosting::{debug, hprintln};
+use nalgebra::Vector3;
+
+/// Instructions in one tick of SysTick: 25 MHz, one instruction a nanosecond.
+const TICK: u32 = 40;
+/// SysTick counts down from here; 24 bits.
+const TOP: u32 = 0x00ff_ffff;
+/// Repetitions of each part.
+const REPETITIONS: u32 = 500;
+/// Control cycles of a whole controller; the first few, in which it joins, do not count.
+const CYCLES: u16 = 40;
+const JOINING: u16 = 5;
+
+/// Frames that a module receives in one control cycle at most: SYNC, GOAL, and STATE and LATENT of each other module.
+const FRAMES: usize = 2 * MAX_MODULES;
+
+/// Numbers without a meaning, the same ones every time (splitmix64).
+struct Random(u64);
+
+impl Random {
+    fn byte(&mut self) -> u8 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        (z >> 56) as u8
+    }
+
+    fn angle(&mut self) -> f32 {
+        f32::from(self.byte() as i8) / 100.0
+    }
+
+    fn latent(&mut self) -> Latent {
+        Latent { key: [(); 16].map(|()| self.byte() as i8), value: [(); 32].map(|()| self.byte() as i8) }
+    }
+}
+
+/// Ticks that `work` takes, at most 2^24.
+fn ticks(work: impl FnOnce()) -> u32 {
+    let before = SYST::get_current();
+    work();
+    before.wrapping_sub(SYST::get_current()) & TOP
+}
+
+/// Ticks that many times `work` takes; always the same code around it.
+#[inline(never)]
+fn repeat(work: &mut dyn FnMut()) -> u32 {
+    ticks(|| (0..REPETITIONS).for_each(|_| work()))
+}
+
+/// Instructions of one call of `work`.
+fn count<T>(mut work: impl FnMut() -> T) -> u32 {
+    let whole = repeat(&mut || {
+        // By reference: the copy would count.
+        black_box(&work());
+    });
+    let empty = repeat(&mut || {
+        black_box(&());
+    });
+    ((whole - empty) * TICK + REPETITIONS / 2) / REPETITIONS
+}
+
+fn report(name: core::fmt::Arguments<'_>, instructions: u32) {
+    hprintln!("{} = {}", name, instructions);
+}
+
+fn sensors(random: &mut Random) -> Sensors {
+    Sensors {
+        joint_angles: [(); 4].map(|()| random.angle()),
+        joint_speeds: [(); 4].map(|()| random.angle()),
+        up: [0.0, 0.1, 0.99],
+        angular_rate: [0.1, -0.2, 0.3],
+        torque: [0.2, -0.1],
+        temperature: 25.0,
+    }
+}
+
+/// The parts of a control step by themselves.
+fn parts(policy: &Policy<'_>, random: &mut Random) {
+    let mut chain = Chain::new(Geometry::default());
+    for module in 0..MAX_MODULES {
+        chain.hear(module, &[(); 4].map(|()| random.angle()));
+    }
+    for module in [0, 3, 7, 63] {
+        let instructions = count(|| black_box(&chain).head_seen_from(black_box(module)));
+        report(format_args!("kinematics/{module}"), instructions);
+    }
+
+    let sensors = sensors(random);
+    let head = chain.head_seen_from(3);
+    let goal = Some(Vector3::new(12.0, -3.0, 0.5));
+    report(format_args!("observation"), count(|| observe(black_box(&sensors), 0.5, black_box(&head), black_box(goal))));
+
+    let observation = observe(&sensors, 0.5, &head, goal);
+    report(format_args!("encode"), count(|| policy.encode(black_box(&observation))));
+
+    let own = policy.encode(&observation);
+    let latents = [(); MAX_MODULES].map(|()| random.latent());
+    let mut attend = 0;
+    for modules in [8, 16, 32, 64] {
+        let heard = u64::MAX >> (64 - modules);
+        let instructions = count(|| policy.attend(black_box(&own), black_box(&latents), black_box(heard), 3));
+        report(format_args!("attention/{modules}"), instructions);
+        if modules == 8 {
+            attend = instructions;
+        }
+    }
+    let act = count(|| policy.act(black_box(&own), black_box(&latents), black_box(0xff), None, 3));
+    report(format_args!("actor"), act.saturating_sub(attend));
+
+    let state = Message::State(State::new(1, Health::SENSORS_PLAUSIBLE, &[0.1, 0.2, 0.3, 0.4]));
+    let latent = Message::Latent(latent_message(policy, 1, own.latent));
+    for (name, message) in [("state", state), ("latent", latent)] {
+        report(format_args!("emit/{name}"), count(|| black_box(&message).emit(black_box(3), true)));
+        let frame = message.emit(3, true);
+        report(format_args!("parse/{name}"), count(|| Message::parse(black_box(&frame))));
+    }
+}
+
+/// A fully connected layer of 64 x 64, requantised, with bias.
+fn dense(random: &mut Random) {
+    let mut weights = [[0; 64]; 64];
+    weights.as_flattened_mut().fill_with(|| random.byte());
+    let multipliers = [(); 64].map(|()| [random.byte(), random.byte(), random.byte(), 0x40]);
+    let bias = [(); 64].map(|()| [random.byte(), random.byte(), 0, 0]);
+    let input = [(); 64].map(|()| i16::from_le_bytes([random.byte(), random.byte()]).max(-32767));
+    let layer = Dense { weights: &weights, multipliers: &multipliers, bias: Some(&bias), shift: 37 };
+    let mut out = [0; 64];
+    report(format_args!("dense64/dsp"), count(|| black_box(&layer).forward(black_box(&input), black_box(&mut out))));
+    report(
+        format_args!("dense64/portable"),
+        count(|| black_box(&layer).forward_portable(black_box(&input), black_box(&mut out))),
+    );
+}
+
+fn latent_message(policy: &Policy<'_>, cycle: u8, latent: Latent) -> LatentMessage {
+    LatentMessage {
+        cycle,
+        health: Health::SENSORS_PLAUSIBLE,
+        policy: policy.tag(),
+        key: latent.key,
+        value: latent.value,
+    }
+}
+
+/// Whole control steps of the last module among `modules`, fed with the frames of all others and of the station.
+fn control_steps(policy: Policy<'_>, modules: u8, random: &mut Random) {
+    let node = modules - 1;
+    let config = Config::new(node, modules, BusKind::Fd, &policy);
+    let period = config.timing.period_us;
+    let Ok(mut controller) = Controller::new(config, policy, 0) else { return };
+    let empty = Message::Sync(Sync::new(0, 0)).emit(0, true);
+    let mut frames = [empty; FRAMES];
+    let (mut sum, mut most) = (0u64, 0);
+    for cycle in 0..CYCLES {
+        let low = cycle as u8;
+        let now = u64::from(period) * (2 + u64::from(cycle));
+        let sensors = sensors(random);
+        let mut received = 0;
+        let mut put = |message: Message, module: u8| {
+            frames[received] = message.emit(module, true);
+            received += 1;
+        };
+        put(Message::Sync(Sync::new(cycle, modules)), 0);
+        put(Message::Goal(Goal::new(low, Some([12.0, -3.0, 0.5]))), STATION);
+        for module in 0..node {
+            let angles = [(); 4].map(|()| random.angle());
+            put(Message::State(State::new(low, Health::SENSORS_PLAUSIBLE, &angles)), module);
+        }
+        for module in 0..node {
+            put(Message::Latent(latent_message(&policy, low, random.latent())), module);
+        }
+        let instructions = TICK
+            * ticks(|| {
+                for (i, frame) in frames.iter().take(received).enumerate() {
+                    step(&mut controller, now + i as u64, &sensors, frame);
+                }
+            });
+        if cycle >= JOINING {
+            sum += u64::from(instructions);
+            most = most.max(instructions);
+        }
+    }
+    let stats = controller.stats();
+    let whole = stats.acted + 1 >= u32::from(CYCLES) && stats.stale == 0 && stats.malformed == 0;
+    if !whole || controller.heard().count_ones() != u32::from(modules) || stats.deadline_misses != 0 {
+        hprintln!("the controller among {} modules did not take part in every cycle: {:?}", modules, stats);
+        debug::exit(debug::EXIT_FAILURE);
+    }
+    report(format_args!("control_step/{modules}/mean"), (sum / u64::from(CYCLES - JOINING)) as u32);
+    report(format_args!("control_step/{modules}/max"), most);
+}
+
+/// What a board does with a frame.
+fn step(controller: &mut Controller<'_>, now: u64, sensors: &Sensors, frame: &Frame) {
+    black_box(controller.poll(now, sensors, Some(frame), BusStatus::ErrorActive));
+    while let Some(frame) = controller.next_frame() {
+        black_box(frame);
+    }
+}
+
+#[entry]
+fn main() -> ! {
+    if let Some(mut core) = cortex_m::Peripherals::take() {
+        core.SYST.set_clock_source(SystClkSource::Core);
+        core.SYST.set_reload(TOP);
+        core.SYST.clear_current();
+        core.SYST.enable_counter();
+    }
+    report(format_args!("controller_bytes"), size_of::<Controller>() as u32);
+    let mut random = Random(1);
+    report(format_args!("calibration"), count(thousand_nops));
+    dense(&mut random);
+    match policies::shipped("goal-reaching").map(Policy::parse) {
+        Some(Ok(policy)) => {
+            parts(&policy, &mut random);
+            for modules in [8, 16, 32, 64] {
+                control_steps(policy, modules, &mut random);
+            }
+            debug::exit(debug::EXIT_SUCCESS);
+        }
+        _ => hprintln!("the shipped policy is not valid"),
+    }
+    debug::exit(debug::EXIT_FAILURE);
+    loop {
+        cortex_m::asm::nop();
+    }
+}
+
+fn thousand_nops() {
+    // SAFETY: does nothing, a thousand times.
+    unsafe { core::arch::asm!(".rept 1000", "nop", ".endr", options(nomem, nostack, preserves_flags)) }
+}
+
+#[panic_handler]
+fn panic(info: &core::panic::PanicInfo) -> ! {
+    hprintln!("{}", info);
+    debug::exit(debug::EXIT_FAILURE);
+    loop {}
+}
