@@ -18,7 +18,7 @@ use crate::robot::Robot;
 pub const NOMINAL_CALIBRATION: &str = include_str!("../configs/calibration.toml");
 
 /// Where `cargo image-stm32g474` leaves the image.
-pub const IMAGE: &str = "target/thumbv7em-none-eabihf/release/composer-stm32g474";
+pub const IMAGE: &str = "target/thumbv7em-none-eabihf/firmware/composer-stm32g474";
 
 /// The chip as probe-rs calls it.
 pub const CHIP: &str = "STM32G474RETx";

@@ -16,7 +16,7 @@ const SIL: [&str; 3] = ["sil", "goal-reaching", "--qemu"];
 fn image() -> PathBuf {
     // The test lies in target/release/deps.
     let program = std::env::current_exe().unwrap();
-    program.ancestors().nth(3).unwrap().join("thumbv7em-none-eabihf/release/composer-qemu")
+    program.ancestors().nth(3).unwrap().join("thumbv7em-none-eabihf/firmware/composer-qemu")
 }
 
 /// Processes whose parent is `parent`, zombies apart.
