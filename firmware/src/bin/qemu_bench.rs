@@ -15,7 +15,7 @@ use composer_firmware::controller::{BusKind, Config, Controller};
 use composer_firmware::failsafe::BusStatus;
 use composer_shared::kinematics::Chain;
 use composer_shared::nn::Dense;
-use composer_shared::observation::{Sensors, observe};
+use composer_shared::observation::{Seeker, Sensors, Told, observe};
 use composer_shared::policies;
 use composer_shared::policy::{Latent, Policy};
 use composer_shared::robot::{Geometry, MAX_MODULES};
@@ -112,10 +112,16 @@ fn parts(policy: &Policy<'_>, random: &mut Random) {
 
     let sensors = sensors(random);
     let head = chain.head_seen_from(3);
-    let goal = Some(Vector3::new(12.0, -3.0, 0.5));
-    report(format_args!("observation"), count(|| observe(black_box(&sensors), 0.5, black_box(&head), black_box(goal))));
+    // What a module is told at most.
+    let points =
+        [Some(Vector3::new(12.0, -3.0, 0.5)), Some(Vector3::new(4.0, 1.0, 0.0)), Some(Vector3::new(8.0, 2.0, 0.0))];
+    let told = Told { points, seeker: Seeker::Head };
+    report(
+        format_args!("observation"),
+        count(|| observe(black_box(&sensors), 0.5, black_box(&head), black_box(&told))),
+    );
 
-    let observation = observe(&sensors, 0.5, &head, goal);
+    let observation = observe(&sensors, 0.5, &head, &told);
     report(format_args!("encode"), count(|| policy.encode(black_box(&observation))));
 
     let own = policy.encode(&observation);
@@ -186,7 +192,7 @@ fn control_steps(policy: Policy<'_>, modules: u8, random: &mut Random) {
             received += 1;
         };
         put(Message::Sync(Sync::new(cycle, modules)), 0);
-        put(Message::Goal(Goal::new(low, Some([12.0, -3.0, 0.5]))), STATION);
+        put(Message::Goal(Goal::new(low, 0, Some([12.0, -3.0, 0.5]))), STATION);
         for module in 0..node {
             let angles = [(); 4].map(|()| random.angle());
             put(Message::State(State::new(low, Health::SENSORS_PLAUSIBLE, &angles)), module);

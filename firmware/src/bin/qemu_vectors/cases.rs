@@ -6,7 +6,7 @@
 use composer_shared::kinematics::Chain;
 use composer_shared::math::sin_cos;
 use composer_shared::nn::{self, Dense, Query};
-use composer_shared::observation::{Sensors, observe};
+use composer_shared::observation::{Seeker, Sensors, Told, observe};
 use composer_shared::policy::{IMAGE_SIZE, ImageWriter, Latent, Layer, Meta, OBS, Policy, random_image};
 use composer_shared::robot::{Geometry, MAX_MODULES};
 use nalgebra::Vector3;
@@ -180,8 +180,12 @@ fn kinematics(side: &mut impl Side) {
         torque: [(); 2].map(|()| side.float()),
         temperature: 20.0,
     };
-    let goal = Vector3::new(side.float(), side.float(), side.float());
-    let observation = observe(&sensors, side.float(), &head, (side.byte() & 7 != 0).then_some(goal));
+    let points = [(); 3].map(|()| {
+        let point = Vector3::new(side.float(), side.float(), side.float());
+        (side.byte() & 7 != 0).then_some(point)
+    });
+    let seeker = if side.byte() & 1 == 0 { Seeker::Head } else { Seeker::Each };
+    let observation = observe(&sensors, side.float(), &head, &Told { points, seeker });
     side.words("observation", observation.map(f32::to_bits));
 }
 
