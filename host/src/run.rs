@@ -243,10 +243,10 @@ mod tests {
         assert_eq!((config.train.learning_rate, config.goal_reaching.goal_distance), (1.0, [4.0, 15.0]));
         assert_eq!(config.env.goal_known_to, Knows::Head);
         // The section of the task comes first.
-        config.set("name=block-pushing").unwrap();
+        config.set("task.name=block-pushing").unwrap();
         config.set("goal_distance=[5, 6]").unwrap();
         assert_eq!(config.block_pushing.goal_distance, [5.0, 6.0]);
-        assert!(config.set("name=dancing").unwrap_err().to_string().contains("no task `dancing`"));
+        assert!(config.set("task.name=dancing").unwrap_err().to_string().contains("no task `dancing`"));
         config.set("task.name=shape-formation").unwrap();
         assert!(config.set("goal_bearing=5").unwrap_err().to_string().contains("say which"));
         config.set("imagination.follow=1").unwrap();
