@@ -41,7 +41,7 @@
 use composer_shared::kinematics::Chain;
 use composer_shared::observation::{POINTS, Sensors, Told, observe, place};
 use composer_shared::policy::{Encoded, GoalKnownTo, Policy};
-use composer_shared::robot::{AXES, Limits, MAX_MODULES};
+use composer_shared::robot::{AXES, Limits, ROOM};
 use composer_shared::wire::{
     EmergencyStop, FRAGMENTS, Frame, Goal, Health, Heartbeat, LatentMessage, Message, Mode, NOBODY, PROTOCOL_VERSION,
     STATION, State, StopCommand, Sync, Telemetry, quantise_angle,
@@ -157,7 +157,7 @@ impl Config {
 
     /// Whether a controller accepts it; if not, why.
     pub fn check(&self) -> Result<(), ConfigError> {
-        if self.modules == 0 || usize::from(self.modules) > MAX_MODULES {
+        if self.modules == 0 || usize::from(self.modules) > ROOM {
             return Err(ConfigError::Modules(self.modules));
         }
         if self.node >= self.modules {
@@ -219,7 +219,7 @@ pub enum ConfigError {
 impl core::fmt::Display for ConfigError {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         match *self {
-            ConfigError::Modules(n) => write!(f, "{n} modules cannot be: a robot has 1 to {MAX_MODULES}"),
+            ConfigError::Modules(n) => write!(f, "{n} modules cannot be: a robot has 1 to {ROOM}"),
             ConfigError::Node { node, modules } => {
                 write!(
                     f,
@@ -386,7 +386,7 @@ pub struct Controller<'a> {
     enabled: bool,
     limited_by: LimitedBy,
     used: u64,
-    attention: [u16; MAX_MODULES],
+    attention: [u16; ROOM],
 
     last_heartbeat: Option<Micros>,
     faults_told: FaultSet,
@@ -434,7 +434,7 @@ impl<'a> Controller<'a> {
             enabled: false,
             limited_by: LimitedBy::Relaxed,
             used: 0,
-            attention: [0; MAX_MODULES],
+            attention: [0; ROOM],
             last_heartbeat: None,
             faults_told: FaultSet::EMPTY,
             stats: Stats::default(),
@@ -562,7 +562,7 @@ impl<'a> Controller<'a> {
     }
 
     /// The attention weights of the last action by module, Q15 (32767 is 1).
-    pub fn attention(&self) -> &[u16; MAX_MODULES] {
+    pub fn attention(&self) -> &[u16; ROOM] {
         &self.attention
     }
 

@@ -29,7 +29,7 @@
 pub mod module;
 
 use composer_shared::observation::Sensors;
-use composer_shared::robot::{AXES, MAX_JOINTS, MAX_MODULES};
+use composer_shared::robot::{AXES, MAX_JOINTS, ROOM};
 use composer_shared::wire::{Frame, Mode};
 use serde::de::{Error as _, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
@@ -192,7 +192,7 @@ impl<'de> Deserialize<'de> for Carried {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Weights {
     /// The weights.
-    pub all: [u16; MAX_MODULES],
+    pub all: [u16; ROOM],
     /// How many of them travel.
     pub modules: u8,
 }
@@ -210,11 +210,11 @@ impl<'de> Deserialize<'de> for Weights {
             type Value = Weights;
 
             fn expecting(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
-                write!(f, "at most {MAX_MODULES} weights")
+                write!(f, "at most {ROOM} weights")
             }
 
             fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Weights, A::Error> {
-                let mut weights = Weights { all: [0; MAX_MODULES], modules: 0 };
+                let mut weights = Weights { all: [0; ROOM], modules: 0 };
                 while let Some(weight) = list.next_element()? {
                     let slot = weights.all.get_mut(usize::from(weights.modules));
                     *slot.ok_or_else(|| A::Error::custom("too many weights"))? = weight;

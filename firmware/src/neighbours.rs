@@ -4,7 +4,7 @@
 //! heard its SYNC, to the next one; frames of any other cycle keep a neighbour alive and say nothing else.
 
 use composer_shared::policy::Latent;
-use composer_shared::robot::MAX_MODULES;
+use composer_shared::robot::ROOM;
 use composer_shared::wire::{FRAGMENTS, Fragment, Health, LatentMessage, State, WireError};
 
 /// What a frame brought.
@@ -52,9 +52,9 @@ pub struct Neighbours {
     silence: Silence,
     silence_state: Silence,
     silence_latent: Silence,
-    states: [State; MAX_MODULES],
-    latents: [Latent; MAX_MODULES],
-    assemblies: [Assembly; MAX_MODULES],
+    states: [State; ROOM],
+    latents: [Latent; ROOM],
+    assemblies: [Assembly; ROOM],
 }
 
 /// The bit of a module; none for a number that cannot be.
@@ -86,9 +86,9 @@ impl Neighbours {
             silence: Silence::NONE,
             silence_state: Silence::NONE,
             silence_latent: Silence::NONE,
-            states: [State::new(0, Health(0), &[0.0; 4]); MAX_MODULES],
-            latents: [Latent::default(); MAX_MODULES],
-            assemblies: [Assembly { data: [[0; 7]; FRAGMENTS], pieces: 0, cycle4: 0 }; MAX_MODULES],
+            states: [State::new(0, Health(0), &[0.0; 4]); ROOM],
+            latents: [Latent::default(); ROOM],
+            assemblies: [Assembly { data: [[0; 7]; FRAGMENTS], pieces: 0, cycle4: 0 }; ROOM],
         }
     }
 
@@ -234,7 +234,7 @@ impl Neighbours {
     }
 
     /// The latents; those outside of [`Neighbours::usable`] are old or empty.
-    pub fn latents(&self) -> &[Latent; MAX_MODULES] {
+    pub fn latents(&self) -> &[Latent; ROOM] {
         &self.latents
     }
 
@@ -253,13 +253,13 @@ impl Neighbours {
 /// For how many cycles each module has been silent in some way.
 #[derive(Clone, Debug)]
 struct Silence {
-    cycles: [u8; MAX_MODULES],
+    cycles: [u8; ROOM],
     /// Those that were silent for less than `dead_after` cycles. Kept, because it is asked for with every frame.
     shorter: u64,
 }
 
 impl Silence {
-    const NONE: Silence = Silence { cycles: [0; MAX_MODULES], shorter: u64::MAX };
+    const NONE: Silence = Silence { cycles: [0; ROOM], shorter: u64::MAX };
 
     /// One more cycle, in which `heard` were not silent.
     fn count(&mut self, heard: u64, modules: u8, dead_after: u8) {

@@ -123,8 +123,7 @@ pub struct Plan {
 pub type Step = (&'static str, Vec<OsString>);
 
 impl Plan {
-    /// The calls of probe-rs, in order. The node page comes before the image and the reset last: a module that was interrupted in between
-    /// finds a part that it refuses, and stays relaxed.
+    /// The calls of probe-rs, in order; each write is verified. The image comes last, so that a new one never starts with the parts of another module.
     pub fn steps(&self) -> Vec<Step> {
         let at = |address: u32| {
             ["--binary-format", "bin", "--base-address"]

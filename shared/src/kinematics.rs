@@ -7,7 +7,7 @@
 use nalgebra::{Matrix3, Vector3};
 
 use crate::math;
-use crate::robot::{DEAD_AFTER, Geometry, MAX_JOINTS, MAX_MODULES};
+use crate::robot::{DEAD_AFTER, Geometry, MAX_JOINTS, ROOM};
 
 /// A rotation and a translation: `point_in_a = rotation * point_in_b + position`.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -43,14 +43,14 @@ impl Pose {
 #[derive(Clone, Debug)]
 pub struct Chain {
     geometry: Geometry,
-    angles: [[f32; MAX_JOINTS]; MAX_MODULES],
-    silent: [u8; MAX_MODULES],
+    angles: [[f32; MAX_JOINTS]; ROOM],
+    silent: [u8; ROOM],
 }
 
 impl Chain {
     /// A straight chain.
     pub fn new(geometry: Geometry) -> Self {
-        Chain { geometry, angles: [[0.0; MAX_JOINTS]; MAX_MODULES], silent: [0; MAX_MODULES] }
+        Chain { geometry, angles: [[0.0; MAX_JOINTS]; ROOM], silent: [0; ROOM] }
     }
 
     /// Takes the joint angles (rad) that `module` published. Values that are not finite, and modules that cannot be, are ignored.
@@ -152,10 +152,10 @@ mod tests {
     #[test]
     fn rotations_stay_orthonormal_over_the_longest_chain() {
         let mut chain = Chain::new(Geometry::default());
-        for module in 0..MAX_MODULES {
+        for module in 0..ROOM {
             chain.hear(module, &[0.9, -0.8, 0.7, 0.6]);
         }
-        let pose = chain.link_seen_from_head(4 * MAX_MODULES - 1);
+        let pose = chain.link_seen_from_head(4 * ROOM - 1);
         assert!(largest(pose.rotation.transpose() * pose.rotation - Matrix3::identity()) < 1e-3);
         let there_and_back = pose.inverse().point(pose.point(Vector3::new(1.0, 2.0, 3.0)));
         assert!(largest(there_and_back - Vector3::new(1.0, 2.0, 3.0)) < 1e-2);
@@ -166,13 +166,13 @@ mod tests {
         let mut chain = Chain::new(Geometry::default());
         chain.hear(2, &[1.0; 4]);
         chain.hear(2, &[f32::NAN; 4]);
-        chain.hear(MAX_MODULES, &[1.0; 4]);
+        chain.hear(ROOM, &[1.0; 4]);
         for _ in 0..DEAD_AFTER - 1 {
             chain.miss(2, 0.5);
             assert_eq!(chain.angles[2], [1.0; 4]);
         }
         chain.miss(2, 0.5);
-        chain.miss(MAX_MODULES, 0.5);
+        chain.miss(ROOM, 0.5);
         assert_eq!(chain.angles[2], [0.5; 4]);
     }
 }

@@ -289,9 +289,9 @@ pub fn ones(mask: u64) -> impl Iterator<Item = usize> {
 /// A logit difference of `d` counts as `requantise(d, multiplier, shift)` in Q16 of base-2 logarithms. Logits must lie
 /// within +-2^30, so that their differences fit. The largest logit is subtracted first: its term is 1, so the sum is
 /// never zero.
-pub fn softmax(logits: &[i32; 64], mask: u64, multiplier: i32, shift: u8) -> [u16; 64] {
-    let mut weights = [0; 64];
-    let mut terms = [0u32; 64];
+pub fn softmax<const N: usize>(logits: &[i32; N], mask: u64, multiplier: i32, shift: u8) -> [u16; N] {
+    let mut weights = [0; N];
+    let mut terms = [0u32; N];
     let largest = ones(mask).filter_map(|j| logits.get(j)).max().copied().unwrap_or(0);
     let mut sum = 0;
     for j in ones(mask) {

@@ -18,7 +18,7 @@ use crc::{CRC_32_ISO_HDLC, Crc};
 
 use crate::nn::{self, Dense};
 use crate::observation::{self, Observation, POINTS, Seeker};
-use crate::robot::{AXES, Geometry, Limits, MAX_JOINTS, MAX_MODULES};
+use crate::robot::{AXES, Geometry, Limits, MAX_JOINTS, ROOM};
 
 /// Version of the layout that this code reads and writes.
 pub const VERSION: u16 = 2;
@@ -654,12 +654,12 @@ impl<'a> Policy<'a> {
     pub fn act(
         &self,
         own: &Encoded,
-        latents: &[Latent; MAX_MODULES],
+        latents: &[Latent; ROOM],
         heard: u64,
-        attention: Option<&mut [u16; MAX_MODULES]>,
+        attention: Option<&mut [u16; ROOM]>,
         own_index: usize,
     ) -> [f32; AXES] {
-        let own_index = own_index.min(MAX_MODULES - 1);
+        let own_index = own_index.min(ROOM - 1);
         let mut hidden = [0; HIDDEN];
         self.hidden.forward(&own.embedding, &mut hidden);
         if self.meta.attention {
@@ -673,7 +673,7 @@ impl<'a> Policy<'a> {
                 *attention = weights;
             }
         } else if let Some(attention) = attention {
-            *attention = [0; MAX_MODULES];
+            *attention = [0; ROOM];
             if let Some(weight) = attention.get_mut(own_index) {
                 *weight = nn::ONE as u16;
             }
@@ -692,14 +692,14 @@ impl<'a> Policy<'a> {
     pub fn attend(
         &self,
         own: &Encoded,
-        latents: &[Latent; MAX_MODULES],
+        latents: &[Latent; ROOM],
         heard: u64,
         own_index: usize,
-    ) -> ([i16; VALUE], [u16; MAX_MODULES]) {
-        let own_index = own_index.min(MAX_MODULES - 1);
+    ) -> ([i16; VALUE], [u16; ROOM]) {
+        let own_index = own_index.min(ROOM - 1);
         let mask = heard | 1u64 << own_index;
         let latent = |j: usize| if j == own_index { &own.latent } else { latents.get(j).unwrap_or(&Latent::ZERO) };
-        let mut logits = [0; MAX_MODULES];
+        let mut logits = [0; ROOM];
         let query = nn::Query::new(&own.query);
         for j in nn::ones(mask) {
             if let Some(logit) = logits.get_mut(j) {
@@ -938,6 +938,7 @@ pub fn random_image(seed: u32, image: &mut [u8; IMAGE_SIZE]) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::robot::MAX_MODULES;
     use proptest::prelude::*;
     use std::boxed::Box;
     use std::string::{String, ToString};

@@ -10,6 +10,9 @@
 
 /// Most modules on one bus: one CAN identifier each, see [`crate::wire`].
 pub const MAX_MODULES: usize = 64;
+/// Modules that this build has room for: all that a bus takes, or 16 with the feature `room-16`. What a module keeps of the others (its
+/// chain, their latents) has so many places.
+pub const ROOM: usize = if cfg!(feature = "room-16") { 16 } else { MAX_MODULES };
 /// Most joints in one module; a STATE frame has room for that many.
 pub const MAX_JOINTS: usize = 4;
 /// Bending axes of a module, one motor each: 0 is yaw, 1 is pitch.

@@ -32,7 +32,10 @@ impl<'a> Module<'a> {
     pub fn serve(&mut self, request: Result<ToModule, LinkError>, send: &mut impl FnMut(&FromModule<'_>)) {
         match request {
             Ok(ToModule::Start { config, now }) => {
-                *self = Module::new(self.policy);
+                // Not `*self = Module::new(..)`: that would be one more controller on the stack.
+                self.controller = None;
+                self.sensors = Sensors::ZERO;
+                self.torque = [0; AXES];
                 match Controller::new(config, self.policy, now) {
                     Ok(controller) => self.controller = Some(controller),
                     Err(error) => send(&FromModule::Refused(Text::of(error).as_str())),
