@@ -4,6 +4,9 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
 use std::{env, fs};
 
+#[path = "src/memory_map.rs"]
+mod memory_map;
+
 fn main() {
     println!("cargo::rerun-if-changed=boards");
     fingerprint();
@@ -22,6 +25,21 @@ fn main() {
     println!("cargo::rustc-link-search={}", out.display());
     println!("cargo::rustc-link-arg-bins=--nmagic");
     println!("cargo::rustc-link-arg-bins=-Tlink.x");
+    if *board == "stm32g474" {
+        println!("cargo::rustc-link-arg-bins=-Tdefmt.x");
+        // `boards/stm32g474.x` is held against these when the image is linked.
+        let map = [
+            ("_flash_address", memory_map::FLASH_ADDRESS),
+            ("_flash_size", memory_map::FLASH_SIZE),
+            ("_policy_address", memory_map::POLICY_ADDRESS),
+            ("_policy_size", memory_map::POLICY_SIZE),
+            ("_node_page_address", memory_map::NODE_PAGE_ADDRESS),
+            ("_node_page_size", memory_map::NODE_PAGE_SIZE),
+        ];
+        for (name, value) in map {
+            println!("cargo::rustc-link-arg-bins=--defsym={name}={value:#x}");
+        }
+    }
 }
 
 /// What the libraries of the controller are built from, boards apart, as one number: a simulator and an image that differ in it

@@ -451,6 +451,7 @@ impl<'a> Controller<'a> {
     ///
     /// Cost: at most one encoding and one action, whatever is received. Never panics. Deadlines are kept on every call, so a flood of
     /// frames does not delay them.
+    #[inline(never)] // The linked image is checked from here on: `tests/tests/image.rs`.
     pub fn poll(&mut self, now: Micros, sensors: &Sensors, received: Option<&Frame>, bus: BusStatus) -> Outputs {
         let now = now.max(self.now);
         self.now = now;
@@ -471,6 +472,7 @@ impl<'a> Controller<'a> {
 
     /// The next frame to send, the most urgent first; call it whenever the CAN port has room. A frame that is still waiting in the port
     /// when the same function is offered again is out of date: replace it if the port can.
+    #[inline(never)] // Like `poll`.
     pub fn next_frame(&mut self) -> Option<Frame> {
         if self.failsafe.silenced() {
             self.outbox = Outbox::default();

@@ -5,6 +5,7 @@ pub mod env;
 pub mod environment;
 pub mod eval;
 pub mod files;
+pub mod flash;
 pub mod freeze;
 pub mod methods;
 pub mod network;

@@ -14,7 +14,7 @@ use composer_sim_bridge::computer::{Computer, Launcher, Poll};
 use composer_sim_bridge::qemu::{PATIENCE, Qemu};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let built = "target/thumbv7em-none-eabihf/release/composer-qemu".to_string();
+    let built = "target/thumbv7em-none-eabihf/firmware/composer-qemu".to_string();
     let firmware = std::env::args().nth(1).unwrap_or(built);
     let mut image = [0; IMAGE_SIZE];
     random_image(1, &mut image);

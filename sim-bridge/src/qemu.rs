@@ -19,6 +19,7 @@
 //!   after two minutes of silence.
 
 use std::io::{self, Read, Seek, Write};
+use std::os::fd::AsRawFd;
 use std::os::unix::net::UnixStream;
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
@@ -67,7 +68,7 @@ impl From<QemuError> for Trouble {
 #[derive(Debug)]
 pub struct Qemu {
     image: PathBuf,
-    policy: tempfile::NamedTempFile,
+    policy: PolicyFile,
     patience: Duration,
     buffered: bool,
 }
@@ -78,12 +79,10 @@ impl Qemu {
         if !image.is_file() {
             return Err(QemuError::NoImage(image.into()));
         }
-        let mut file =
-            tempfile::Builder::new().prefix("composer-").suffix(".policy").tempfile().map_err(QemuError::Policy)?;
-        file.write_all(policy).map_err(QemuError::Policy)?;
+        let policy = PolicyFile::new(policy).map_err(QemuError::Policy)?;
         // Zero would mean for ever.
         let patience = patience.max(Duration::from_millis(1));
-        Ok(Qemu { image: image.into(), policy: file, patience, buffered: true })
+        Ok(Qemu { image: image.into(), policy, patience, buffered: true })
     }
 
     /// The same without the buffer before the UART, for comparison.
@@ -106,7 +105,7 @@ impl Qemu {
             .args(["-serial", "chardev:link"]);
         command.args(["-semihosting-config", "enable=on,target=native", "-kernel"]).arg(&self.image);
         // A comma in a file name is doubled in QEMU's lists.
-        let policy = self.policy.path().to_string_lossy().replace(',', ",,");
+        let policy = self.policy.path.to_string_lossy().replace(',', ",,");
         command.arg("-device").arg(format!("loader,file={policy},addr={POLICY_ADDRESS:#x},force-raw=on"));
         command
     }
@@ -126,6 +125,28 @@ impl Qemu {
             _ => QemuError::Start(error),
         })?;
         Ok(Process { child, stream: near, complaints, patience: self.patience })
+    }
+}
+
+/// The policy image where QEMU can read it. On Linux without a name in the file system, so that nothing is left if this program is killed.
+#[derive(Debug)]
+struct PolicyFile {
+    path: PathBuf,
+    /// Keeps the file.
+    _file: std::fs::File,
+    _name: Option<tempfile::TempPath>,
+}
+
+impl PolicyFile {
+    fn new(image: &[u8]) -> io::Result<Self> {
+        let mut file = tempfile::NamedTempFile::new()?;
+        file.write_all(image)?;
+        let (file, name) = file.into_parts();
+        if cfg!(target_os = "linux") {
+            let path = format!("/proc/{}/fd/{}", std::process::id(), file.as_raw_fd()).into();
+            return Ok(PolicyFile { path, _file: file, _name: None });
+        }
+        Ok(PolicyFile { path: name.to_path_buf(), _file: file, _name: Some(name) })
     }
 }
 

@@ -1,4 +1,4 @@
-//! A module's computer at the end of a [link](composer_firmware::link).
+//! A module's computer at the end of a [link].
 
 use std::collections::VecDeque;
 use std::time::Duration;

@@ -16,7 +16,7 @@ const SIL: [&str; 3] = ["sil", "goal-reaching", "--qemu"];
 fn image() -> PathBuf {
     // The test lies in target/release/deps.
     let program = std::env::current_exe().unwrap();
-    program.ancestors().nth(3).unwrap().join("thumbv7em-none-eabihf/release/composer-qemu")
+    program.ancestors().nth(3).unwrap().join("thumbv7em-none-eabihf/firmware/composer-qemu")
 }
 
 /// Processes whose parent is `parent`, zombies apart.
@@ -49,7 +49,7 @@ fn wait_until(what: &str, mut is: impl FnMut() -> bool) {
 /// A run whose eight modules work.
 fn running(folder: &Path, more: &[&str]) -> (Child, Vec<u32>) {
     let mut run = command(folder, &[&SIL[..], &["--episodes", "1", "--json"], more].concat());
-    let mut child = run.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let mut child = run.env("TMPDIR", folder).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let pid = child.id();
     wait_until("eight modules run", || {
         assert!(child.try_wait().unwrap().is_none(), "it ended before: {}", complaint(&mut child));
@@ -139,6 +139,7 @@ fn no_module_outlives_a_simulator_that_is_killed() {
         signal(run.id(), name);
         assert!(!run.wait().unwrap().success());
         wait_until("no module is left", || !modules.iter().any(|module| alive(*module)));
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "no file is left either");
     }
 }
 

@@ -59,27 +59,26 @@ impl Random {
     }
 }
 
-/// Instructions that `work` takes, at most 2^24 ticks.
+/// Ticks that `work` takes, at most 2^24.
 fn ticks(work: impl FnOnce()) -> u32 {
     let before = SYST::get_current();
     work();
     before.wrapping_sub(SYST::get_current()) & TOP
 }
 
+/// Ticks that many times `work` takes; always the same code around it.
+#[inline(never)]
+fn repeat(work: &mut dyn FnMut()) -> u32 {
+    ticks(|| (0..REPETITIONS).for_each(|_| work()))
+}
+
 /// Instructions of one call of `work`.
 fn count<T>(mut work: impl FnMut() -> T) -> u32 {
-    let repeat = |times: u32, work: &mut dyn FnMut()| {
-        ticks(|| {
-            for _ in 0..times {
-                work();
-            }
-        })
-    };
-    let whole = repeat(REPETITIONS, &mut || {
+    let whole = repeat(&mut || {
         // By reference: the copy would count.
         black_box(&work());
     });
-    let empty = repeat(REPETITIONS, &mut || {
+    let empty = repeat(&mut || {
         black_box(&());
     });
     ((whole - empty) * TICK + REPETITIONS / 2) / REPETITIONS
@@ -232,6 +231,7 @@ fn main() -> ! {
         core.SYST.clear_current();
         core.SYST.enable_counter();
     }
+    report(format_args!("controller_bytes"), size_of::<Controller>() as u32);
     let mut random = Random(1);
     report(format_args!("calibration"), count(thousand_nops));
     dense(&mut random);
@@ -252,10 +252,8 @@ fn main() -> ! {
 }
 
 fn thousand_nops() {
-    for _ in 0..10 {
-        // SAFETY: does nothing, a hundred times.
-        unsafe { core::arch::asm!(".rept 100", "nop", ".endr", options(nomem, nostack, preserves_flags)) }
-    }
+    // SAFETY: does nothing, a thousand times.
+    unsafe { core::arch::asm!(".rept 1000", "nop", ".endr", options(nomem, nostack, preserves_flags)) }
 }
 
 #[panic_handler]

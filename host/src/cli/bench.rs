@@ -1,5 +1,7 @@
 //! `snakectl bench`: speed of physics, training and bus on this machine, side by side in one run.
 
+mod firmware;
+
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -23,10 +25,19 @@ const LENGTHS: [usize; 4] = [8, 16, 32, 64];
 
 /// Arguments of `bench`.
 #[derive(clap::Args, Clone, Debug)]
+#[command(args_conflicts_with_subcommands = true)]
 pub struct Arguments {
+    #[command(subcommand)]
+    what: Option<What>,
     /// Seconds for each figure
     #[arg(long, default_value_t = 5.0)]
     seconds: f64,
+}
+
+#[derive(clap::Subcommand, Clone, Debug)]
+enum What {
+    /// Count the instructions of the controller on an emulated Cortex-M4F instead (needs qemu-system-arm).
+    Firmware(firmware::Arguments),
 }
 
 /// Control steps per second over all threads.
@@ -93,6 +104,9 @@ fn bus(image: &[u8], robot: &Robot, seconds: f64) -> Result<(f64, f64)> {
 
 /// Runs the verb.
 pub fn run(arguments: &Arguments) -> Result<()> {
+    if let Some(What::Firmware(arguments)) = &arguments.what {
+        return firmware::run(arguments);
+    }
     let seconds = arguments.seconds;
     let cores = super::cores();
     let robot = Robot::default();

@@ -5,6 +5,7 @@ mod dbc;
 mod demo;
 mod eval;
 mod export;
+mod flash;
 mod policy_file;
 mod report;
 mod sil;
@@ -44,6 +45,8 @@ enum Verb {
     Bench(bench::Arguments),
     /// Show the shipped policy of one task on the simulated bus.
     Demo(demo::OneTask),
+    /// Make a module of a board: image, policy and node page by a debug probe.
+    Flash(flash::Arguments),
     /// Print the bus's message database in DBC form.
     Dbc(dbc::Arguments),
 }
@@ -65,6 +68,7 @@ pub fn main() -> ExitCode {
         Some(Verb::Sil(arguments)) => sil::run(&arguments),
         Some(Verb::Report(arguments)) => report::run(&arguments),
         Some(Verb::Bench(arguments)) => bench::run(&arguments),
+        Some(Verb::Flash(arguments)) => flash::run(&arguments),
         Some(Verb::Dbc(arguments)) => dbc::run(&arguments),
         Some(Verb::Demo(arguments)) => demo::run_one(&arguments),
         None => demo::run(&arguments.demonstration),

@@ -102,7 +102,7 @@ fn built_image() -> Option<PathBuf> {
     let program = std::env::current_exe().ok()?;
     let release = program.parent()?;
     let target = if release.ends_with("deps") { release.parent()?.parent()? } else { release.parent()? };
-    Some(target.join("thumbv7em-none-eabihf/release/composer-qemu"))
+    Some(target.join("thumbv7em-none-eabihf/firmware/composer-qemu"))
 }
 
 /// Arguments of `sil`.

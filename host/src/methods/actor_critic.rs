@@ -224,15 +224,15 @@ impl CriticLayout {
         ]
     }
 
-    /// Initial parameters: orthogonal, gain sqrt 2 (1 for the output), zero bias.
-    pub fn initial(&self, seed: u64) -> Vec<f32> {
+    /// Initial parameters: orthogonal, gain sqrt 2 (`value_gain` for the output), zero bias.
+    pub fn initial(&self, seed: u64, value_gain: f32) -> Vec<f32> {
         let mut p = vec![0.0; self.len];
         let mut rng = stream(seed, Stream::Weights, 1, 0);
         for (block, gain) in [
             (self.first, std::f32::consts::SQRT_2),
             (self.second, std::f32::consts::SQRT_2),
             (self.team, std::f32::consts::SQRT_2),
-            (self.value, 1.0),
+            (self.value, value_gain),
         ] {
             p[block.range()].copy_from_slice(&orthogonal(block.rows, block.columns, gain, &mut rng));
         }

@@ -8,7 +8,7 @@
 //! p'_i = p_i + R_i (bound * u_i / max(1, |u_i|))
 //! ```
 //!
-//! with `R_i` the rotation of the module's own frame. Three things are not as the paper prints them, but as they must be meant:
+//! with `R_i` the rotation of the module's own frame. Some things are not as the paper prints them, but as they must be meant:
 //!
 //! - The displacement is bounded. Without a bound "goal minus position" is the best answer everywhere, and no step towards anything. The
 //!   bound is a ball: under a box the best answer is nearly always a corner, up to 55 degrees off the way.
@@ -16,6 +16,7 @@
 //!   decrease `d(p, g) - d(p', g)` where its task pays for progress and `-0.1 d(p', g)` where it pays the paper's reward.
 //! - `r_f`, a sum of errors, is added to the reward in the paper; it must be taken off. Here it is
 //!   `r_f = -follow * mean_i |p_{i,t+1} - p'_{i,t}|`, a mean, so that the weight holds for any number of modules.
+//! - Where the text and Algorithm 1 give the imagination policy the control policy's parameters theta, its own (psi) are meant.
 //!
 //! A dead module neither imagines (it stays where it is) nor is asked to follow.
 
@@ -39,8 +40,8 @@ pub struct ImaginationConfig {
     pub bound: f64,
     /// Standard deviation of each component of u at the start, as a fraction of the bound.
     pub sigma: f64,
-    /// Discount of the imagination policy's reward per control step, 0 to 1. What is imagined does not change what happens next, so any
-    /// discount has the same best policy; later rewards only add noise to its gradient.
+    /// Discount of the imagination policy's reward per control step, 0 to 1. What is imagined does not change what happens next in
+    /// an episode, so any discount has the same best policy; later rewards only add noise to its gradient.
     pub gamma: f64,
     /// Epochs of its actor (at most, as for the control policy's) and of its critic. Fewer than the control policy's: it has the easier
     /// task, and every epoch costs time.

@@ -60,10 +60,11 @@ pub struct Learner {
 }
 
 impl Learner {
-    /// A learner that has learnt nothing; `sigma` is the standard deviation of the actions at the start.
-    pub fn new(layout: ActorLayout, seed: u64, sigma: f32, adam_epsilon: f32) -> Self {
+    /// A learner that has learnt nothing; `sigma` is the standard deviation of the actions at the start, `value_gain` the gain of the
+    /// critic's output.
+    pub fn new(layout: ActorLayout, seed: u64, sigma: f32, value_gain: f32, adam_epsilon: f32) -> Self {
         let actor = layout.initial(seed, sigma);
-        let critic = CriticLayout::default().initial(seed);
+        let critic = CriticLayout::default().initial(seed, value_gain);
         Self {
             layout,
             seed,
@@ -338,8 +339,8 @@ mod tests {
     }
 
     fn rollout(method: Method) -> Rollout {
-        let mut control = Learner::new(ActorLayout::control(method), 5, 0.45, 1e-5);
-        let mut imagination = Learner::new(ActorLayout::imagination(), 6, 0.45, 1e-5);
+        let mut control = Learner::new(ActorLayout::control(method), 5, 0.45, 1.0, 1e-5);
+        let mut imagination = Learner::new(ActorLayout::imagination(), 6, 0.45, 1.0, 1e-5);
         let mut rng = stream(9, Stream::Weights, 7, 7);
         for learner in [&mut control, &mut imagination] {
             learner.actor.iter_mut().chain(&mut learner.critic).for_each(|p| *p += 0.3 * (rng.random::<f32>() - 0.5));

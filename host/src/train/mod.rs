@@ -254,13 +254,17 @@ impl Trainer {
         for index in 0..config.environments {
             slots.push(Slot::new(checked(make(index)?, index)?, index, config.seed));
         }
-        let learner = |layout, seed, sigma: f64| Learner::new(layout, seed, sigma as f32, config.adam_epsilon as f32);
+        let epsilon = config.adam_epsilon as f32;
+        let control = Learner::new(ActorLayout::control(config.method), config.seed, config.sigma as f32, 1.0, epsilon);
+        let imagination = config.method.imagination().then(|| {
+            let seed = derive_seed(config.seed, Stream::Imagination, 0, 0);
+            let sigma = config.imagination.sigma as f32;
+            // What is imagined earns a tenth of a unit: a critic that starts with numbers of size 1 would take long to get there.
+            Learner::new(ActorLayout::imagination(), seed, sigma, 0.01, epsilon)
+        });
         Ok(Self {
-            control: learner(ActorLayout::control(config.method), config.seed, config.sigma),
-            imagination: config.method.imagination().then(|| {
-                let seed = derive_seed(config.seed, Stream::Imagination, 0, 0);
-                learner(ActorLayout::imagination(), seed, config.imagination.sigma)
-            }),
+            control,
+            imagination,
             observations: Running::new(SIZE),
             privileged: Running::new(PRIVILEGED),
             experience: Experience::new(config.environments),

@@ -1,59 +1,50 @@
 #![allow(unsafe_code)]
 //! Integer kernels for processors with the DSP extension of ARMv7E-M (Cortex-M4, M7): the same sums as the portable ones in
 //! [`super`], two products an instruction.
+//!
+//! The intrinsics for these instructions are not stable in Rust, inline assembler is. On other processors this module does not exist.
 
 use core::arch::asm;
+
+/// One instruction that computes a register from others.
+macro_rules! compute {
+    ($instruction:literal, $($operand:expr),+) => {{
+        let result;
+        // SAFETY: reads and writes the registers named, and no flag but Q.
+        unsafe { asm!($instruction, lateout(reg) result, $(in(reg) $operand),+, options(pure, nomem, nostack)) }
+        result
+    }};
+}
 
 /// Bytes 0 and 2 of `x`, each extended to 16 bits with its sign.
 #[inline(always)]
 fn sxtb16(x: u32) -> u32 {
-    let y;
-    // SAFETY: an instruction on registers.
-    unsafe { asm!("sxtb16 {}, {}", lateout(reg) y, in(reg) x, options(pure, nomem, nostack, preserves_flags)) }
-    y
+    compute!("sxtb16 {}, {}", x)
 }
 
 /// Bytes 1 and 3 of `x`, each extended to 16 bits with its sign.
 #[inline(always)]
 fn sxtb16_ror8(x: u32) -> u32 {
-    let y;
-    // SAFETY: an instruction on registers.
-    unsafe { asm!("sxtb16 {}, {}, ror #8", lateout(reg) y, in(reg) x, options(pure, nomem, nostack, preserves_flags)) }
-    y
+    compute!("sxtb16 {}, {}, ror #8", x)
 }
 
 /// The lower half of `low` below the lower half of `high`.
 #[inline(always)]
 fn pkhbt(low: u32, high: u32) -> u32 {
-    let y;
-    // SAFETY: an instruction on registers.
-    unsafe {
-        asm!("pkhbt {}, {}, {}, lsl #16", lateout(reg) y, in(reg) low, in(reg) high, options(pure, nomem, nostack, preserves_flags))
-    }
-    y
+    compute!("pkhbt {}, {}, {}, lsl #16", low, high)
 }
 
 /// The upper half of `low` below the upper half of `high`.
 #[inline(always)]
 fn pkhtb(high: u32, low: u32) -> u32 {
-    let y;
-    // SAFETY: an instruction on registers.
-    unsafe {
-        asm!("pkhtb {}, {}, {}, asr #16", lateout(reg) y, in(reg) high, in(reg) low, options(pure, nomem, nostack, preserves_flags))
-    }
-    y
+    compute!("pkhtb {}, {}, {}, asr #16", high, low)
 }
 
-/// `sum` plus the products of the lower and of the upper halves of `a` and `b`, signed. The sum wraps; it sets the processor's
-/// Q flag then, which nobody reads.
+/// `sum` plus the products of the lower and of the upper halves of `a` and `b`, signed. The sum wraps, and nobody reads the Q flag that
+/// says so.
 #[inline(always)]
 fn smlad(a: u32, b: u32, sum: i32) -> i32 {
-    let y;
-    // SAFETY: an instruction on registers.
-    unsafe {
-        asm!("smlad {}, {}, {}, {}", lateout(reg) y, in(reg) a, in(reg) b, in(reg) sum, options(pure, nomem, nostack, preserves_flags));
-    }
-    y
+    compute!("smlad {}, {}, {}, {}", a, b, sum)
 }
 
 /// Activations in the order in which `sxtb16` takes weights apart: of four in a row 0, 2, 1, 3.

@@ -14,7 +14,7 @@ pub fn image(program: &str, features: &str) -> PathBuf {
         .canonicalize()
         .expect("the firmware is beside the tests");
     let output = Command::new(env!("CARGO"))
-        .args(["build", "--release", "--quiet", "--message-format=json", "--target", TARGET])
+        .args(["build", "--profile", "firmware", "--quiet", "--message-format=json", "--target", TARGET])
         .args(["--bin", program, "--features", features, "--manifest-path"])
         .arg(manifest)
         .output()
@@ -22,8 +22,8 @@ pub fn image(program: &str, features: &str) -> PathBuf {
     assert!(output.status.success(), "{program} does not build:\n{}", String::from_utf8_lossy(&output.stderr));
     let messages = String::from_utf8(output.stdout).expect("UTF-8");
     let artifacts = messages.lines().filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok());
-    let executables = artifacts.filter_map(|artifact| Some(PathBuf::from(artifact["executable"].as_str()?)));
-    executables.last().unwrap_or_else(|| panic!("cargo built no {program}"))
+    let mut executables = artifacts.filter_map(|artifact| Some(PathBuf::from(artifact["executable"].as_str()?)));
+    executables.next().unwrap_or_else(|| panic!("cargo built no {program}"))
 }
 
 /// Whether the image ended with success, and what it printed. It is killed after a minute.

@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
+use object::elf::SectionFlags as SectionBits;
 use object::{Object, ObjectSection, ObjectSymbol, SectionFlags, SectionKind, SymbolKind, elf};
 
 use crate::thumb::{self, Effect};
@@ -18,8 +19,6 @@ pub struct Function {
     pub calls: BTreeSet<u32>,
     /// Why not all of that is known, if so.
     pub unknown: BTreeSet<&'static str>,
-    /// Whether it has an instruction that stops the processor with a fault.
-    pub traps: bool,
 }
 
 /// A linked image.
@@ -43,12 +42,14 @@ impl Image {
         let file = object::File::parse(&*bytes).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
         let (mut flash, mut ram) = (0, 0);
         for section in file.sections() {
-            let SectionFlags::Elf { sh_flags } = section.flags() else { panic!("{} is no ELF file", path.display()) };
-            if sh_flags & u64::from(elf::SHF_ALLOC) == 0 {
+            let SectionFlags::Elf { sh_flags: SectionBits(sh_flags), .. } = section.flags() else {
+                panic!("{} is no ELF file", path.display())
+            };
+            if sh_flags & elf::SHF_ALLOC.0 == 0 {
                 continue;
             }
             let (writable, stored) =
-                (sh_flags & u64::from(elf::SHF_WRITE) != 0, section.kind() != SectionKind::UninitializedData);
+                (sh_flags & elf::SHF_WRITE.0 != 0, section.kind() != SectionKind::UninitializedData);
             flash += if stored { section.size() } else { 0 };
             ram += if writable { section.size() } else { 0 };
         }
@@ -129,13 +130,12 @@ impl Image {
                 complaints.push(chain());
                 continue;
             }
-            let traps = function.traps.then_some("traps");
-            complaints.extend(function.unknown.iter().copied().chain(traps).map(|why| format!("{} {why}", chain())));
+            complaints.extend(function.unknown.iter().map(|why| format!("{} {why}", chain())));
             for &callee in &function.calls {
-                if !came_from.contains_key(&callee) {
-                    came_from.insert(callee, address);
+                came_from.entry(callee).or_insert_with(|| {
                     open.push(callee);
-                }
+                    address
+                });
             }
         }
         complaints
@@ -191,7 +191,7 @@ impl Image {
 
 /// Reads the instructions of a function.
 fn function(name: String, start: u32, code: &[u8], marks: &BTreeMap<u32, bool>) -> Function {
-    let (mut frame, mut calls, mut unknown, mut traps) = (0, BTreeSet::new(), BTreeSet::new(), false);
+    let (mut frame, mut calls, mut unknown) = (0, BTreeSet::new(), BTreeSet::new());
     let halfword = |at: usize| code.get(at..at + 2).map_or(0, |b| u16::from_le_bytes([b[0], b[1]]));
     let end = start + code.len() as u32;
     let mut at = 0;
@@ -217,9 +217,8 @@ fn function(name: String, start: u32, code: &[u8], marks: &BTreeMap<u32, bool>) 
             Effect::UnknownStack => {
                 unknown.insert("moves the stack pointer by what a register says");
             }
-            Effect::Trap => traps = true,
         }
         at += 2 * thumb::length(first);
     }
-    Function { name, frame, calls, unknown, traps }
+    Function { name, frame, calls, unknown }
 }

@@ -16,8 +16,6 @@ pub enum Effect {
     Indirect,
     /// The stack pointer becomes something that the instruction alone does not tell.
     UnknownStack,
-    /// The permanently undefined instruction: a trap.
-    Trap,
 }
 
 /// The number of halfwords of an instruction that begins so.
@@ -56,9 +54,7 @@ fn narrow(address: u32, i: u16) -> Effect {
         0x46bd => Effect::None,
         // MOV SP and ADD SP with a register
         _ if i & 0xff87 == 0x4685 || i & 0xff87 == 0x4485 => Effect::UnknownStack,
-        // UDF
-        0xde00..=0xdeff => Effect::Trap,
-        // B<c>; SVC is 0xdf.
+        // B<c>. Next in line are UDF, which the compiler puts where an enumeration has no value, and SVC.
         0xd000..=0xddff => Effect::Jump(target(address, signed(word & 0xff, 8) * 2)),
         // B
         0xe000..=0xe7ff => Effect::Jump(target(address, signed(word & 0x7ff, 11) * 2)),
@@ -77,10 +73,7 @@ fn wide(address: u32, first: u16, second: u16) -> Effect {
             let to = target(address, signed(s << 23 | i1 << 22 | i2 << 21 | (a & 0x3ff) << 11 | b & 0x7ff, 24) * 2);
             return if second & 0x4000 != 0 { Effect::Call(to) } else { Effect::Jump(to) };
         }
-        if first & 0xfff0 == 0xf7f0 {
-            return Effect::Trap;
-        }
-        // Above are MSR, barriers and other system instructions.
+        // Conditions 14 and 15 are MSR, barriers and other system instructions.
         if a >> 6 & 15 < 14 && second & 0x4000 == 0 {
             // B<c>.W
             let offset = signed(s << 19 | j2 << 18 | j1 << 17 | (a & 0x3f) << 11 | b & 0x7ff, 20) * 2;
@@ -152,7 +145,7 @@ fn encodings_are_those_of_the_assembler() {
         ("bne.w #1000", 0xf040, 0x81f4, Effect::Jump(0x13ec)),
         ("ldr.w pc, [r0, r1, lsl #2]", 0xf850, 0xf021, Effect::Indirect),
         ("dmb sy", 0xf3bf, 0x8f5f, Effect::None),
-        ("udf #254", 0xdefe, 0, Effect::Trap),
+        ("udf #254", 0xdefe, 0, Effect::None),
     ];
     for (text, first, second, expected) in cases {
         assert_eq!(effect(0x1000, first, second), expected, "{text}");

@@ -1,0 +1,280 @@
+//! The image of a module's board: STM32G474RE (Cortex-M4F, 170 MHz) with FDCAN, four joint encoders, an inertial sensor, two motors.
+//!
+//! # Pins
+//!
+//! | pin | function | to |
+//! |---|---|---|
+//! | PF0, PF1 | HSE, 24 MHz crystal | CAN-FD needs better than the internal oscillator |
+//! | PA11, PA12 | FDCAN1 RX, TX | CAN-FD transceiver for 5 Mbit/s (for example TCAN1044V), its standby tied low |
+//! | PA5, PA6, PA7 | SPI1 SCK, MISO, MOSI, mode 1, 5.3 MHz | four AS5047P, all on this bus |
+//! | PC6, PC7, PC8, PC9 | chip selects, low active | encoders of joint 0 to 3, head end first |
+//! | PC10, PC11, PC12 | SPI3 SCK, MISO, MOSI, mode 3, 5.3 MHz | LSM6DSO |
+//! | PD2 | chip select, low active | LSM6DSO |
+//! | PA8, PA9 | TIM1 CH1, CH2, PWM 20 kHz | EN inputs of the bridges: yaw, pitch |
+//! | PB4, PB5 | direction | PH inputs of the bridges: yaw, pitch |
+//! | PB6, PB7 | enable, with pull-downs on the board | nSLEEP of the bridges: yaw, pitch; low lets the motor coast |
+//! | PA0, PA1 | ADC1 IN1, IN2 | current sense of yaw, pitch: an amplifier in the motor line (for example INA240), half the range at no current |
+//! | PA2 | ADC1 IN3 | supply voltage over 10 kohm : 1 kohm |
+//! | PC4, PC5 | ADC2 IN5, IN11 | thermistors of yaw, pitch: 10 kohm, 3435 K, below 10 kohm |
+//! | PB10 | status light | on: running; flashing once: no node page, twice: no policy |
+//! | PA13, PA14 | SWDIO, SWCLK | debug probe: flashing, and the log (defmt over RTT) |
+//!
+//! # Who runs when
+//!
+//! - The interrupt of the ADC, 10,000 times a second: the current loops ([`drive`]).
+//! - The interrupts of FDCAN: received frames into a queue, because the chip's own holds only three ([`can`]).
+//! - The main loop: waits for a frame, the controller's deadline, or the next sample of the sensors a millisecond later; polls the
+//!   controller, sets the motors, sends what it offers.
+//!
+//! The independent watchdog is fed by the main loop and only if the current loops ran since the last time. Anything that stops either
+//! resets the chip within [`WATCHDOG_US`]; then all pins float and the motors coast.
+//!
+//! This image was built and looked at, but has not run on a chip yet.
+#![no_std]
+#![no_main]
+
+mod can;
+mod drive;
+mod fail;
+mod flash;
+mod sense;
+
+use core::cell::RefCell;
+
+use composer_firmware::controller::{BusKind, Config, ConfigError, Controller, FIRMWARE_VERSION};
+use composer_firmware::node_page::NodePage;
+use composer_shared::observation::Sensors;
+use composer_shared::policy::Policy;
+use composer_shared::robot::AXES;
+use composer_shared::wire::{Fault, Health, Heartbeat, Message, Mode, NOBODY, PROTOCOL_VERSION};
+use defmt::Display2Format;
+use defmt_rtt as _;
+use embassy_executor::Spawner;
+use embassy_stm32::adc::{Adc, AdcConfig};
+use embassy_stm32::bind_interrupts;
+use embassy_stm32::gpio::{Level, Output, Speed};
+use embassy_stm32::peripherals::{FDCAN1, IWDG};
+use embassy_stm32::rcc::{self, mux};
+use embassy_stm32::spi::{MODE_1, MODE_3, Spi};
+use embassy_stm32::time::Hertz;
+use embassy_stm32::wdg::IndependentWatchdog;
+use embassy_time::{Duration, Instant, Timer, with_deadline};
+use static_cell::StaticCell;
+
+use can::CanPort;
+use sense::Sense;
+
+bind_interrupts!(struct Irqs {
+    FDCAN1_IT0 => embassy_stm32::can::IT0InterruptHandler<FDCAN1>;
+    FDCAN1_IT1 => embassy_stm32::can::IT1InterruptHandler<FDCAN1>;
+});
+
+defmt::timestamp!("{=u64:us}", now());
+
+type Watchdog = IndependentWatchdog<'static, IWDG>;
+
+/// One control period: a module that hangs pulls no longer than that.
+const WATCHDOG_US: u32 = 50_000;
+/// Time between two samples of the sensors; the inertial sensor has a new one every 0.6 ms.
+const SAMPLE: Duration = Duration::from_millis(1);
+/// Time between two HEARTBEAT frames of a module without a policy. Every one of them makes the others wait for its latent for three
+/// cycles, so they are rare.
+const REFUSED_HEARTBEAT: Duration = Duration::from_secs(2);
+
+/// 170 MHz for the core, the timers and FDCAN, from the crystal.
+fn clocks() -> rcc::Config {
+    let mut config = rcc::Config::new();
+    config.hse = Some(rcc::Hse { freq: Hertz(24_000_000), mode: rcc::HseMode::Oscillator });
+    config.hsi48 = None;
+    config.pll = Some(rcc::Pll {
+        source: rcc::PllSource::HSE,
+        prediv: rcc::PllPreDiv::DIV6,
+        mul: rcc::PllMul::MUL85,
+        divp: None,
+        divq: Some(rcc::PllQDiv::DIV2),
+        divr: Some(rcc::PllRDiv::DIV2),
+    });
+    config.sys = rcc::Sysclk::PLL1_R;
+    config.boost = true;
+    config.mux.fdcansel = mux::Fdcansel::PLL1_Q;
+    config.mux.adc12sel = mux::Adcsel::SYS;
+    config
+}
+
+fn now() -> u64 {
+    Instant::now().as_micros()
+}
+
+#[embassy_executor::main]
+async fn main(_spawner: Spawner) -> ! {
+    let mut config = embassy_stm32::Config::default();
+    config.rcc = clocks();
+    let p = embassy_stm32::init(config);
+    let mut watchdog = Watchdog::new(p.IWDG, WATCHDOG_US);
+    watchdog.unleash();
+    fail::prepare();
+    let mut light = Output::new(p.PB10, Level::Low, Speed::Low);
+
+    let page = match flash::node_page() {
+        Ok(page) => page,
+        Err(error) => {
+            defmt::error!("{}", Display2Format(&error));
+            // Without a number of its own it must not send anything.
+            refuse(1, None, &mut light, &mut watchdog).await
+        }
+    };
+    defmt::info!("module {=u8} of {=u8}", page.node, page.modules);
+    let mut can = CanPort::new(p.FDCAN1, p.PA11, p.PA12, page.bus_off);
+    let policy = match flash::policy() {
+        Ok(policy) => policy,
+        Err(error) => {
+            defmt::error!("{}", Display2Format(&error));
+            refuse(2, Some((&mut can, page.node)), &mut light, &mut watchdog).await
+        }
+    };
+    defmt::info!("policy {=u32:08x} for {=str}", policy.crc(), policy.task().name());
+    let controller = match make_controller(&page, policy) {
+        Ok(controller) => controller,
+        Err(error) => {
+            defmt::error!("{}", Display2Format(error));
+            refuse(2, Some((&mut can, page.node)), &mut light, &mut watchdog).await
+        }
+    };
+    light.set_high();
+
+    // Both converters before either is set up further: they share a reset.
+    let (adc1, adc2) = (Adc::new(p.ADC1, AdcConfig::default()), Adc::new(p.ADC2, AdcConfig::default()));
+    let bridges = drive::Bridges {
+        pwm: (p.PA8, p.PA9),
+        direction: [p.PB4.into(), p.PB5.into()],
+        enable: [p.PB6.into(), p.PB7.into()],
+    };
+    drive::start(p.TIM1, bridges, adc1, (p.PA0, p.PA1, p.PA2), &page.calibration.motors);
+    let encoders = RefCell::new(Spi::new_blocking(p.SPI1, p.PA5, p.PA7, p.PA6, sense::spi_config(MODE_1)));
+    let imu = Spi::new_blocking(p.SPI3, p.PC10, p.PC12, p.PC11, sense::spi_config(MODE_3));
+    let mut sense = Sense::new(
+        (&encoders, [p.PC6.into(), p.PC7.into(), p.PC8.into(), p.PC9.into()]),
+        (imu, p.PD2.into()),
+        (adc2, p.PC4, p.PC5),
+        &page,
+        policy.geometry(),
+    );
+    run(controller, policy.limits().torque, &mut can, &mut sense, &mut watchdog).await
+}
+
+/// Makes the controller where it stays. Apart, and not inlined, because it is large: a copy of it in the frame of the main loop would take
+/// stack for ever.
+#[inline(never)]
+fn make_controller(
+    page: &NodePage,
+    policy: Policy<'static>,
+) -> Result<&'static mut Controller<'static>, &'static mut ConfigError> {
+    static CONTROLLER: StaticCell<Result<Controller<'static>, ConfigError>> = StaticCell::new();
+    let settings = Config { bus_off: page.bus_off, ..Config::new(page.node, page.modules, BusKind::Fd, &policy) };
+    CONTROLLER.init_with(|| Controller::new(settings, policy, now())).as_mut()
+}
+
+/// The main loop.
+async fn run(
+    controller: &mut Controller<'static>,
+    torque_limit: f32,
+    can: &mut CanPort,
+    sense: &mut Sense<'_>,
+    watchdog: &mut Watchdog,
+) -> ! {
+    let mut sensors = Sensors::ZERO;
+    let mut deadline = Instant::now();
+    let mut sample_at = Instant::now();
+    let mut sampled_at = Instant::now();
+    let mut enabled = false;
+    let mut loops = 0;
+    loop {
+        let received = with_deadline(deadline.min(sample_at), can.receive()).await.ok();
+        let moment = Instant::now();
+        let drive = drive::measured();
+        if moment >= sample_at {
+            // After a long computation some samples are left out instead of made up for.
+            sample_at = moment + SAMPLE;
+            let seconds = (moment - sampled_at).as_micros() as f32 * 1e-6;
+            sampled_at = moment;
+            // A motor that was cut off has no torque that anybody knows: the sample is not plausible, the controller reports fault 39.
+            let torque = core::array::from_fn::<_, AXES, _>(|axis| match drive.trip[axis] {
+                Some(_) => f32::NAN,
+                None => drive.torque[axis] / torque_limit,
+            });
+            sensors = sense.sample(seconds, torque);
+            log_trouble(&drive, sense);
+        }
+        let outputs = controller.poll(now(), &sensors, received.as_ref(), can.status());
+        drive::command(drive::Command {
+            torque: outputs.motors_enabled.then_some(outputs.torque),
+            // Who relaxes the motors and allows them again (release after an emergency stop) gives a motor that was cut off another chance.
+            rearm: outputs.motors_enabled && !enabled,
+        });
+        enabled = outputs.motors_enabled;
+        deadline = Instant::from_micros(outputs.deadline);
+        can.send(|| controller.next_frame());
+        if drive.loops != loops {
+            loops = drive.loops;
+            watchdog.pet();
+        }
+    }
+}
+
+/// Says once a second what is wrong with sensors and motors.
+fn log_trouble(drive: &drive::Measured, sense: &mut Sense<'_>) {
+    if !sense.log_due() {
+        return;
+    }
+    for (axis, trip) in drive.trip.iter().enumerate() {
+        if let Some(trip) = trip {
+            defmt::error!("motor {=usize} is cut off: {=str}", axis, trip.name());
+        }
+    }
+    let (joints, imu) = sense.errors();
+    for (joint, error) in joints.iter().enumerate() {
+        if let Some(error) = error {
+            defmt::warn!("encoder {=usize}: {=str}", joint, error.name());
+        }
+    }
+    if let Some(error) = imu {
+        defmt::warn!("inertial sensor: {=str}", error.name());
+    }
+}
+
+/// A module that cannot run: the motors are off, the light says why (`flashes` in a row), and with a number it sends HEARTBEAT now and then, so
+/// that the station sees it. Ends with a restart only.
+async fn refuse(flashes: u8, can: Option<(&mut CanPort, u8)>, light: &mut Output<'_>, watchdog: &mut Watchdog) -> ! {
+    let heartbeat = can.map(|(can, node)| {
+        let heartbeat = Heartbeat {
+            mode: Mode::Boot as u8,
+            fault: Fault::PolicyMismatch as u8,
+            health: Health::FAULT,
+            time_keeper: NOBODY,
+            protocol: PROTOCOL_VERSION,
+            firmware: FIRMWARE_VERSION,
+            policy: 0,
+        };
+        (can, Message::Heartbeat(heartbeat).emit(node, true))
+    });
+    let mut heartbeat = heartbeat;
+    let mut heartbeat_at = Instant::now();
+    let mut blink = 0;
+    loop {
+        if let Some((can, frame)) = &mut heartbeat
+            && Instant::now() >= heartbeat_at
+        {
+            heartbeat_at += REFUSED_HEARTBEAT;
+            let mut frame = Some(*frame);
+            can.send(|| frame.take());
+        }
+        // On and off for every flash, then a pause as long as six.
+        blink = (blink + 1) % (2 * (flashes + 3));
+        light.set_level((blink % 2 == 1 && blink < 2 * flashes).into());
+        // In pieces, each shorter than the watchdog's patience.
+        for _ in 0..8 {
+            watchdog.pet();
+            Timer::after_millis(25).await;
+        }
+    }
+}

@@ -1,0 +1,243 @@
+//! All sensors of a module together: what the controller polls with.
+//!
+//! A reading that fails once is bridged with the one before, because a flipped bit on a wire is no reason to go blind. After
+//! [`HOLD`] failures in a row it is not a number, the sample is not [plausible](Sensors::plausible), and the controller reports fault 39.
+
+use composer_shared::observation::Sensors;
+use composer_shared::robot::{AXES, MAX_JOINTS};
+use embedded_hal::delay::DelayNs;
+use embedded_hal::spi::SpiDevice;
+
+use super::encoder::{As5047p, EncoderError, JointCalibration, SpeedEstimator};
+use super::imu::{ImuError, Lsm6dso, Motion};
+
+/// Failures in a row that are bridged.
+pub const HOLD: u8 = 4;
+
+/// Bandwidth of the speed estimate, rad/s: 25 Hz, two and a half times what a control period of 50 ms can use.
+const SPEED_BANDWIDTH: f32 = 157.0;
+
+/// A joint with its encoder.
+#[derive(Debug)]
+pub struct Joint<S, D> {
+    encoder: As5047p<S, D>,
+    calibration: JointCalibration,
+    estimator: SpeedEstimator,
+    angle: f32,
+    speed: f32,
+    /// Time since the last good reading, s.
+    since: f32,
+    failures: u8,
+    error: Option<EncoderError>,
+}
+
+impl<S: SpiDevice, D: DelayNs> Joint<S, D> {
+    /// A joint that was not read yet.
+    pub fn new(encoder: As5047p<S, D>, calibration: JointCalibration) -> Self {
+        Joint {
+            encoder,
+            calibration,
+            estimator: SpeedEstimator::new(SPEED_BANDWIDTH),
+            angle: f32::NAN,
+            speed: f32::NAN,
+            since: 0.0,
+            failures: 0,
+            error: None,
+        }
+    }
+
+    fn read(&mut self, seconds: f32) {
+        self.since += seconds;
+        match self.encoder.angle() {
+            Ok(reading) => {
+                self.angle = self.calibration.angle(reading);
+                self.speed = self.estimator.update(self.angle, self.since);
+                (self.since, self.failures, self.error) = (0.0, 0, None);
+            }
+            Err(error) => {
+                self.error = Some(error);
+                self.failures = self.failures.saturating_add(1);
+                if self.failures > HOLD {
+                    (self.angle, self.speed) = (f32::NAN, f32::NAN);
+                    self.estimator.reset();
+                }
+            }
+        }
+    }
+}
+
+/// The sensors of a module.
+#[derive(Debug)]
+pub struct ModuleSensors<E, I, D> {
+    joints: [Joint<E, D>; MAX_JOINTS],
+    /// Joints that exist.
+    count: usize,
+    imu: Lsm6dso<I>,
+    motion: Motion,
+    imu_failures: u8,
+    imu_error: Option<ImuError>,
+}
+
+const UNKNOWN: Motion = Motion { up: [f32::NAN; 3], rate: [f32::NAN; 3] };
+
+impl<E: SpiDevice, I: SpiDevice, D: DelayNs> ModuleSensors<E, I, D> {
+    /// The sensors of a module whose first `count` joints exist; the others read 0 and their encoders are left alone.
+    pub fn new(joints: [Joint<E, D>; MAX_JOINTS], count: usize, imu: Lsm6dso<I>) -> Self {
+        ModuleSensors { joints, count, imu, motion: UNKNOWN, imu_failures: 0, imu_error: None }
+    }
+
+    /// Sets up the inertial sensor: at the start, and whenever [`ModuleSensors::imu_lost`].
+    pub fn init(&mut self, delay: &mut impl DelayNs) -> Result<(), ImuError> {
+        let result = self.imu.init(delay);
+        self.imu_error = result.err();
+        self.imu_failures = 0;
+        result
+    }
+
+    /// Reads everything, `seconds` after the last time. `torque` (fractions of the limit) and `temperature` (degrees Celsius) come from the motors.
+    pub fn sample(&mut self, seconds: f32, torque: [f32; AXES], temperature: f32) -> Sensors {
+        let mut sensors = Sensors { torque, temperature, ..Sensors::ZERO };
+        let readings = sensors.joint_angles.iter_mut().zip(&mut sensors.joint_speeds);
+        for (joint, (angle, speed)) in self.joints.iter_mut().take(self.count).zip(readings) {
+            joint.read(seconds);
+            (*angle, *speed) = (joint.angle, joint.speed);
+        }
+        match self.imu.sample() {
+            Ok(motion) => {
+                self.motion = motion;
+                (self.imu_failures, self.imu_error) = (0, None);
+            }
+            Err(error) => {
+                self.imu_error = Some(error);
+                self.imu_failures = self.imu_failures.saturating_add(1);
+                if self.imu_failures > HOLD {
+                    self.motion = UNKNOWN;
+                }
+            }
+        }
+        (sensors.up, sensors.angular_rate) = (self.motion.up, self.motion.rate);
+        sensors
+    }
+
+    /// Whether the inertial sensor has been silent for so long that it should be set up anew: a hundred samples.
+    pub fn imu_lost(&self) -> bool {
+        self.imu_failures >= 100
+    }
+
+    /// What failed in the last sample, for the log: joint by joint, then the inertial sensor.
+    pub fn errors(&self) -> ([Option<EncoderError>; MAX_JOINTS], Option<ImuError>) {
+        (self.joints.each_ref().map(|joint| joint.error), self.imu_error)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::encoder::tests::{GOOD, sample};
+    use super::super::imu::tests::{STRAIGHT, burst};
+    use super::*;
+    use embedded_hal_mock::eh1::delay::NoopDelay;
+    use embedded_hal_mock::eh1::spi::{Mock, Transaction};
+    use std::vec::Vec;
+
+    const LEVEL: [i16; 3] = [0, 0, 8197];
+
+    struct Chips {
+        encoders: [Mock<u8>; MAX_JOINTS],
+        imu: Mock<u8>,
+    }
+
+    fn module(count: usize) -> (ModuleSensors<Mock<u8>, Mock<u8>, NoopDelay>, Chips) {
+        let chips = Chips { encoders: core::array::from_fn(|_| Mock::new(&[])), imu: Mock::new(&[]) };
+        let joints = chips.encoders.each_ref().map(|spi| {
+            let calibration = JointCalibration { zero: 0, reversed: false };
+            Joint::new(As5047p::new(spi.clone(), NoopDelay), calibration)
+        });
+        (ModuleSensors::new(joints, count, Lsm6dso::new(chips.imu.clone(), STRAIGHT)), chips)
+    }
+
+    impl Chips {
+        /// Answers with these angles (none: magnet lost), the inertial sensor with this.
+        fn answer(&mut self, angles: &[Option<u16>], imu: Vec<Transaction<u8>>) {
+            for (spi, angle) in self.encoders.iter_mut().zip(angles) {
+                spi.update_expectations(&sample(angle.unwrap_or(0), if angle.is_some() { GOOD } else { 0x9ff }));
+            }
+            self.imu.update_expectations(&imu);
+        }
+
+        fn done(&mut self) {
+            self.encoders.iter_mut().for_each(Mock::done);
+            self.imu.done();
+        }
+    }
+
+    fn good_imu() -> Vec<Transaction<u8>> {
+        burst(3, [0, 0, 0], LEVEL)
+    }
+
+    #[test]
+    fn a_whole_sample() {
+        let (mut module, mut chips) = module(4);
+        chips.answer(&[Some(0), Some(4096), Some(12288), Some(1)], good_imu());
+        let sensors = module.sample(1e-3, [0.5, -0.25], 31.0);
+        assert!(sensors.plausible(), "{sensors:?}");
+        assert!((sensors.joint_angles[1] - core::f32::consts::FRAC_PI_2).abs() < 1e-6);
+        assert!((sensors.joint_angles[2] + core::f32::consts::FRAC_PI_2).abs() < 1e-6);
+        assert_eq!((sensors.torque, sensors.temperature), ([0.5, -0.25], 31.0));
+        assert_eq!(module.errors(), ([None; 4], None));
+        chips.done();
+    }
+
+    #[test]
+    fn a_joint_that_does_not_exist_reads_zero() {
+        let (mut module, mut chips) = module(3);
+        chips.answer(&[Some(5); 3], good_imu());
+        let sensors = module.sample(1e-3, [0.0; 2], 31.0);
+        assert_eq!((sensors.joint_angles[3], sensors.joint_speeds[3]), (0.0, 0.0));
+        assert!(sensors.plausible());
+        chips.done();
+    }
+
+    #[test]
+    fn one_lost_sample_is_bridged_and_a_lost_magnet_is_not() {
+        let (mut module, mut chips) = module(4);
+        chips.answer(&[Some(100); 4], good_imu());
+        let before = module.sample(1e-3, [0.0; 2], 30.0);
+        for _ in 0..HOLD {
+            chips.answer(&[Some(100), None, Some(100), Some(100)], good_imu());
+            let bridged = module.sample(1e-3, [0.0; 2], 30.0);
+            assert!(bridged.plausible() && bridged.joint_angles == before.joint_angles);
+            assert_eq!(module.errors().0[1], Some(EncoderError::MagnetTooWeak));
+            chips.done();
+        }
+        chips.answer(&[Some(100), None, Some(100), Some(100)], good_imu());
+        let blind = module.sample(1e-3, [0.0; 2], 30.0);
+        assert!(blind.joint_angles[1].is_nan() && !blind.plausible());
+        assert_eq!(blind.joint_angles[0], before.joint_angles[0], "the others go on");
+        chips.answer(&[Some(100); 4], good_imu());
+        assert!(module.sample(1e-3, [0.0; 2], 30.0).plausible(), "and it comes back");
+        chips.done();
+    }
+
+    #[test]
+    fn a_silent_inertial_sensor_is_not_plausible_and_set_up_anew() {
+        let (mut module, mut chips) = module(4);
+        chips.answer(&[Some(0); 4], good_imu());
+        assert!(module.sample(1e-3, [0.0; 2], 30.0).plausible());
+        for i in 1..=100u8 {
+            assert!(!module.imu_lost());
+            chips.answer(&[Some(0); 4], burst(0, [0; 3], LEVEL));
+            let sensors = module.sample(1e-3, [0.0; 2], 30.0);
+            assert_eq!(sensors.plausible(), i <= HOLD, "after {i}");
+            chips.done();
+        }
+        assert!(module.imu_lost() && module.errors().1 == Some(ImuError::Stale));
+    }
+
+    #[test]
+    fn nothing_is_plausible_before_the_first_reading() {
+        let (mut module, mut chips) = module(4);
+        chips.answer(&[None; 4], burst(0, [0; 3], LEVEL));
+        assert!(!module.sample(1e-3, [0.0; 2], 30.0).plausible());
+        chips.done();
+    }
+}

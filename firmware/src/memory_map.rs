@@ -1,0 +1,27 @@
+//! Where things lie in the flash of the board `stm32g474`: the one definition, for the board that reads, for the host that
+//! writes, and for the linker script `boards/stm32g474.x`, which the linker holds against these numbers.
+//!
+//! | region | from | bytes | content |
+//! |---|---|---|---|
+//! | code | 0x0800_0000 | 444 K | the image |
+//! | policy | 0x0806_f000 | 64 K | a policy image ([`composer_shared::policy`]) |
+//! | node page | 0x0807_f000 | 4 K | what makes this module this module (`node_page`) |
+//!
+//! Every region begins at a multiple of 4 KB, the largest page that this chip has (2 KB with two banks, 4 KB with one), so that each can be
+//! erased without its neighbours.
+
+/// First byte of the flash.
+pub const FLASH_ADDRESS: u32 = 0x0800_0000;
+/// Bytes of flash for code and constants.
+pub const FLASH_SIZE: u32 = 444 * 1024;
+/// Where the policy image lies.
+pub const POLICY_ADDRESS: u32 = FLASH_ADDRESS + FLASH_SIZE;
+/// Most bytes that a policy image may have.
+pub const POLICY_SIZE: u32 = 64 * 1024;
+/// Where the node page lies.
+pub const NODE_PAGE_ADDRESS: u32 = POLICY_ADDRESS + POLICY_SIZE;
+/// Bytes reserved for the node page.
+pub const NODE_PAGE_SIZE: u32 = 4 * 1024;
+
+// All 512 KB are given away, and nothing twice.
+const _: () = assert!(NODE_PAGE_ADDRESS + NODE_PAGE_SIZE == FLASH_ADDRESS + 512 * 1024);

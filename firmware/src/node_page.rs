@@ -1,0 +1,444 @@
+//! The node page: what makes a module this one of the robot, and what was measured on its own hardware. It lies in a flash page of its own
+//! ([`crate::memory_map`]), is written by the host (`snakectl flash`) and read by the board at power-up, so that all modules run the
+//! same image and the same policy.
+//!
+//! # Layout, version 1
+//!
+//! 128 bytes, all numbers little-endian; `f32` is IEEE 754 binary32. "Not a number" and infinities lie outside of every range.
+//!
+//! | offset | type | field | accepted |
+//! |---|---|---|---|
+//! | 0 | u8\[8\] | magic | the ASCII characters `COMPNODE` |
+//! | 8 | u16 | layout version | 1 |
+//! | 10 | u8 | number of this module, 0 is the head | 0 to modules - 1 |
+//! | 11 | u8 | modules of the robot | 1 to 64 |
+//! | 12 | u8 | after bus-off: 0 recover, 1 stay off until a restart | 0, 1 |
+//! | 13 | u8\[3\] | reserved | 0 |
+//! | 16 + 4 j | u16 | encoder of joint j: what it reads when the joint is straight | 0 to 16383 |
+//! | 18 + 4 j | u8 | encoder of joint j: 1 if it counts down while the joint angle grows | 0, 1 |
+//! | 19 + 4 j | u8 | reserved | 0 |
+//! | 32 | f32\[9\] | rotation from the axes of the inertial sensor to the module's own frame, row by row | a rotation |
+//! | 68 + 28 m | f32 | motor m (0 yaw, 1 pitch): torque units per ampere; negative if the wires are swapped | magnitude 0.001 to 1000000 |
+//! | 72 + 28 m | f32 | largest current, A | 0.001 to 100 |
+//! | 76 + 28 m | f32 | current that cuts the motor off, A | the largest current to 200 |
+//! | 80 + 28 m | f32 | winding resistance, ohm | 0.001 to 1000 |
+//! | 84 + 28 m | f32 | winding inductance, H | 0.000001 to 1 |
+//! | 88 + 28 m | f32 | current sense: A from one end of the converter's range to the other; negative if it is turned | magnitude 0.001 to 1000 |
+//! | 92 + 28 m | f32 | current sense: reading without current, part of the range | 0 to 1 |
+//! | 124 | u32 | CRC-32 (ISO-HDLC) of bytes 0 to 123 | |
+
+use core::fmt;
+
+use composer_shared::robot::{AXES, MAX_JOINTS, MAX_MODULES};
+use crc::{CRC_32_ISO_HDLC, Crc};
+
+use crate::drivers::encoder::{JointCalibration, STEPS};
+use crate::failsafe::BusOffPolicy;
+
+/// Bytes of a node page; a multiple of 8, the least that the flash writes.
+pub const SIZE: usize = 128;
+/// Version of the layout that this code reads and writes.
+pub const VERSION: u16 = 1;
+/// The first bytes of every node page.
+pub const MAGIC: [u8; 8] = *b"COMPNODE";
+
+const VERSION_AT: usize = 8;
+const NODE_AT: usize = 10;
+const MODULES_AT: usize = 11;
+const BUS_OFF_AT: usize = 12;
+const RESERVED_AT: usize = 13;
+const ENCODERS_AT: usize = 16;
+const ENCODER_SIZE: usize = 4;
+const MOUNTING_AT: usize = ENCODERS_AT + ENCODER_SIZE * MAX_JOINTS;
+const MOTORS_AT: usize = MOUNTING_AT + 9 * 4;
+const MOTOR_SIZE: usize = 7 * 4;
+const CRC_AT: usize = MOTORS_AT + MOTOR_SIZE * AXES;
+const _: () = assert!(CRC_AT + 4 == SIZE);
+
+const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
+
+/// How far the rows of a rotation may be from orthonormal.
+const ORTHONORMAL: f32 = 1e-3;
+
+/// A motor and its current sense, as measured.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct MotorCalibration {
+    /// Torque per ampere, in the robot's torque unit, gear included. Negative if the wires are swapped.
+    pub torque_constant: f32,
+    /// Largest current, A.
+    pub current_limit: f32,
+    /// Current that cuts the motor off, A.
+    pub cut_off: f32,
+    /// Winding resistance, ohm.
+    pub resistance: f32,
+    /// Winding inductance, H.
+    pub inductance: f32,
+    /// Current from one end of the converter's range to the other, A.
+    pub sense_range: f32,
+    /// Reading without current, as a part of the converter's range.
+    pub sense_zero: f32,
+}
+
+impl MotorCalibration {
+    /// The current (A) for a reading as a part of the converter's range.
+    pub fn current(&self, reading: f32) -> f32 {
+        (reading - self.sense_zero) * self.sense_range
+    }
+}
+
+/// What was measured on the hardware of one module.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Calibration {
+    /// How the encoders sit, head end first.
+    pub joints: [JointCalibration; MAX_JOINTS],
+    /// Rotation from the axes of the inertial sensor to the module's own frame, row by row.
+    pub imu_mounting: [[f32; 3]; 3],
+    /// Motors, yaw and pitch.
+    pub motors: [MotorCalibration; AXES],
+}
+
+/// A node page, checked.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct NodePage {
+    /// The module's number, 0 is the head.
+    pub node: u8,
+    /// Modules of the robot.
+    pub modules: u8,
+    /// What to do after bus-off.
+    pub bus_off: BusOffPolicy,
+    /// What was measured.
+    pub calibration: Calibration,
+}
+
+/// Why a node page is refused.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum NodePageError {
+    /// The flash is erased: no module was made of this board yet.
+    Empty,
+    /// Fewer bytes than a node page has.
+    TooShort {
+        /// Bytes given.
+        length: usize,
+    },
+    /// The first bytes are not [`MAGIC`].
+    Magic,
+    /// Another layout version.
+    Version {
+        /// The version it has.
+        found: u16,
+    },
+    /// The checksum is not that of the bytes before it.
+    Checksum {
+        /// As stored.
+        stored: u32,
+        /// As computed.
+        computed: u32,
+    },
+    /// A field with a value that cannot be.
+    Value {
+        /// What it is.
+        field: &'static str,
+        /// What is accepted.
+        accepted: &'static str,
+    },
+}
+
+impl fmt::Display for NodePageError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match *self {
+            Self::Empty => write!(f, "the node page is empty: write it with `snakectl flash --node N`"),
+            Self::TooShort { length } => {
+                write!(f, "the node page is cut short: it has {length} bytes where {SIZE} are needed")
+            }
+            Self::Magic => write!(f, "this is not a node page: it does not begin with COMPNODE"),
+            Self::Version { found } => {
+                write!(
+                    f,
+                    "the node page has layout version {found}, this build reads version {VERSION}: write it again"
+                )
+            }
+            Self::Checksum { stored, computed } => {
+                write!(f, "the node page is damaged: its CRC-32 should be {stored:08x} and is {computed:08x}")
+            }
+            Self::Value { field, accepted } => {
+                write!(f, "the node page has a {field} that cannot be: accepted is {accepted}")
+            }
+        }
+    }
+}
+
+impl core::error::Error for NodePageError {}
+
+impl NodePage {
+    /// Reads a node page from the flash region it lies in; bytes after it are ignored.
+    pub fn parse(region: &[u8]) -> Result<Self, NodePageError> {
+        let short = NodePageError::TooShort { length: region.len() };
+        let bytes = region.first_chunk::<SIZE>().ok_or(short)?;
+        let field = |at: usize| bytes.get(at).copied();
+        let word = |at: usize| bytes.get(at..).and_then(|rest| rest.first_chunk::<4>()).map(|b| u32::from_le_bytes(*b));
+        // All offsets lie within the page, so `short` cannot happen from here on. It saves the board from a panic.
+        let byte = |at: usize| field(at).ok_or(short);
+        let float = |at: usize| word(at).map(f32::from_bits).ok_or(short);
+
+        let magic = bytes.first_chunk::<8>().ok_or(short)?;
+        if *magic == [0xff; 8] {
+            return Err(NodePageError::Empty);
+        }
+        if *magic != MAGIC {
+            return Err(NodePageError::Magic);
+        }
+        let found = u16::from_le_bytes([byte(VERSION_AT)?, byte(VERSION_AT + 1)?]);
+        if found != VERSION {
+            return Err(NodePageError::Version { found });
+        }
+        let stored = word(CRC_AT).ok_or(short)?;
+        let computed = CRC.checksum(bytes.get(..CRC_AT).ok_or(short)?);
+        if stored != computed {
+            return Err(NodePageError::Checksum { stored, computed });
+        }
+
+        let bus_off = match byte(BUS_OFF_AT)? {
+            0 => BusOffPolicy::Recover,
+            1 => BusOffPolicy::Latch,
+            _ => return Err(NodePageError::Value { field: "choice after bus-off", accepted: "0 or 1" }),
+        };
+        let mut reserved = bytes.get(RESERVED_AT..ENCODERS_AT).ok_or(short)?.iter().fold(0, |all, b| all | b);
+        let mut joints = [JointCalibration { zero: 0, reversed: false }; MAX_JOINTS];
+        for (j, joint) in joints.iter_mut().enumerate() {
+            let at = ENCODERS_AT + ENCODER_SIZE * j;
+            joint.zero = u16::from_le_bytes([byte(at)?, byte(at + 1)?]);
+            joint.reversed = match byte(at + 2)? {
+                0 => false,
+                1 => true,
+                _ => return Err(NodePageError::Value { field: "direction of an encoder", accepted: "0 or 1" }),
+            };
+            reserved |= byte(at + 3)?;
+        }
+        if reserved != 0 {
+            return Err(NodePageError::Value { field: "reserved byte", accepted: "0" });
+        }
+        let mut imu_mounting = [[0.0; 3]; 3];
+        for (i, value) in imu_mounting.iter_mut().flatten().enumerate() {
+            *value = float(MOUNTING_AT + 4 * i)?;
+        }
+        let motor = |m: usize| {
+            let float = |i: usize| float(MOTORS_AT + MOTOR_SIZE * m + 4 * i);
+            Ok(MotorCalibration {
+                torque_constant: float(0)?,
+                current_limit: float(1)?,
+                cut_off: float(2)?,
+                resistance: float(3)?,
+                inductance: float(4)?,
+                sense_range: float(5)?,
+                sense_zero: float(6)?,
+            })
+        };
+        let calibration = Calibration { joints, imu_mounting, motors: [motor(0)?, motor(1)?] };
+        let page = NodePage { node: byte(NODE_AT)?, modules: byte(MODULES_AT)?, bus_off, calibration };
+        page.check()?;
+        Ok(page)
+    }
+
+    /// The bytes to write; refuses what [`NodePage::parse`] would refuse.
+    pub fn encode(&self) -> Result<[u8; SIZE], NodePageError> {
+        self.check()?;
+        let mut bytes = [0; SIZE];
+        let mut put = |at: usize, what: &[u8]| bytes[at..at + what.len()].copy_from_slice(what);
+        put(0, &MAGIC);
+        put(VERSION_AT, &VERSION.to_le_bytes());
+        put(NODE_AT, &[self.node]);
+        put(MODULES_AT, &[self.modules]);
+        put(BUS_OFF_AT, &[u8::from(self.bus_off == BusOffPolicy::Latch)]);
+        for (j, joint) in self.calibration.joints.iter().enumerate() {
+            put(ENCODERS_AT + ENCODER_SIZE * j, &joint.zero.to_le_bytes());
+            put(ENCODERS_AT + ENCODER_SIZE * j + 2, &[u8::from(joint.reversed)]);
+        }
+        for (i, value) in self.calibration.imu_mounting.iter().flatten().enumerate() {
+            put(MOUNTING_AT + 4 * i, &value.to_le_bytes());
+        }
+        for (m, motor) in self.calibration.motors.iter().enumerate() {
+            let MotorCalibration { torque_constant, current_limit, cut_off, .. } = *motor;
+            let MotorCalibration { resistance, inductance, sense_range, sense_zero, .. } = *motor;
+            let fields = [torque_constant, current_limit, cut_off, resistance, inductance, sense_range, sense_zero];
+            for (i, value) in fields.iter().enumerate() {
+                put(MOTORS_AT + MOTOR_SIZE * m + 4 * i, &value.to_le_bytes());
+            }
+        }
+        let crc = CRC.checksum(&bytes[..CRC_AT]);
+        bytes[CRC_AT..].copy_from_slice(&crc.to_le_bytes());
+        Ok(bytes)
+    }
+
+    fn check(&self) -> Result<(), NodePageError> {
+        let within = |value: f32, low: f32, high: f32| value >= low && value <= high;
+        let Calibration { joints, imu_mounting, motors } = &self.calibration;
+        let all = |good: &dyn Fn(&MotorCalibration) -> bool| motors.iter().all(good);
+        let checks = [
+            ((1..=MAX_MODULES).contains(&usize::from(self.modules)), "number of modules", "1 to 64"),
+            (self.node < self.modules, "number of this module", "0 to the number of modules - 1"),
+            (joints.iter().all(|joint| joint.zero < STEPS), "zero of an encoder", "0 to 16383"),
+            (
+                is_rotation(imu_mounting),
+                "mounting of the inertial sensor",
+                "a rotation: orthonormal rows, right-handed",
+            ),
+            (
+                all(&|m| within(m.torque_constant.abs(), 1e-3, 1e6)),
+                "torque constant",
+                "0.001 to 1000000 torque units per ampere",
+            ),
+            (all(&|m| within(m.current_limit, 1e-3, 100.0)), "current limit", "0.001 to 100 A"),
+            (all(&|m| within(m.cut_off, m.current_limit, 200.0)), "cut-off current", "the current limit to 200 A"),
+            (all(&|m| within(m.resistance, 1e-3, 1e3)), "winding resistance", "0.001 to 1000 ohm"),
+            (all(&|m| within(m.inductance, 1e-6, 1.0)), "winding inductance", "0.000001 to 1 H"),
+            (all(&|m| within(m.sense_range.abs(), 1e-3, 1e3)), "range of the current sense", "0.001 to 1000 A"),
+            (all(&|m| within(m.sense_zero, 0.0, 1.0)), "zero of the current sense", "0 to 1"),
+        ];
+        match checks.into_iter().find(|(good, ..)| !good) {
+            Some((_, field, accepted)) => Err(NodePageError::Value { field, accepted }),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Whether the rows are of unit length, at right angles, and right-handed.
+fn is_rotation(rows: &[[f32; 3]; 3]) -> bool {
+    let [a, b, c] = rows;
+    let dot = |p: &[f32; 3], q: &[f32; 3]| p[0] * q[0] + p[1] * q[1] + p[2] * q[2];
+    let cross = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+    let near = |value: f32, wanted: f32| (value - wanted).abs() < ORTHONORMAL;
+    near(dot(a, a), 1.0)
+        && near(dot(b, b), 1.0)
+        && near(dot(a, b), 0.0)
+        && cross.iter().zip(c).all(|(x, y)| near(*x, *y))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use std::string::ToString;
+    use std::vec::Vec;
+
+    fn page() -> NodePage {
+        let motor = MotorCalibration {
+            torque_constant: 80.0,
+            current_limit: 1.2,
+            cut_off: 2.5,
+            resistance: 4.0,
+            inductance: 1e-3,
+            sense_range: 6.6,
+            sense_zero: 0.5,
+        };
+        let mut joints = [JointCalibration { zero: 0, reversed: false }; MAX_JOINTS];
+        joints[2] = JointCalibration { zero: 0x1234, reversed: true };
+        NodePage {
+            node: 3,
+            modules: 8,
+            bus_off: BusOffPolicy::Latch,
+            calibration: Calibration {
+                joints,
+                imu_mounting: [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
+                motors: [motor, MotorCalibration { torque_constant: -79.0, ..motor }],
+            },
+        }
+    }
+
+    fn mended(mut bytes: [u8; SIZE]) -> [u8; SIZE] {
+        let crc = CRC.checksum(&bytes[..CRC_AT]);
+        bytes[CRC_AT..].copy_from_slice(&crc.to_le_bytes());
+        bytes
+    }
+
+    #[test]
+    fn the_bytes_are_those_of_the_table() {
+        let bytes = page().encode().unwrap();
+        assert_eq!(bytes[..16], *b"COMPNODE\x01\0\x03\x08\x01\0\0\0");
+        assert_eq!(bytes[24..28], [0x34, 0x12, 1, 0]);
+        assert_eq!(bytes[36..40], 1.0f32.to_le_bytes());
+        assert_eq!(bytes[68..72], 80.0f32.to_le_bytes());
+        assert_eq!(bytes[96..100], (-79.0f32).to_le_bytes());
+        assert_eq!(bytes[120..124], 0.5f32.to_le_bytes());
+        // The same checksum as the policy image's: of "123456789" it is 0xcbf43926.
+        assert_eq!(CRC.checksum(b"123456789"), 0xcbf4_3926);
+        assert_eq!(bytes[124..], CRC.checksum(&bytes[..124]).to_le_bytes());
+    }
+
+    #[test]
+    fn what_was_written_is_read() {
+        let mut region = [0xff; 4096];
+        region[..SIZE].copy_from_slice(&page().encode().unwrap());
+        assert_eq!(NodePage::parse(&region), Ok(page()));
+    }
+
+    #[test]
+    fn every_reason_to_refuse_has_a_name() {
+        let good = page().encode().unwrap();
+        assert_eq!(NodePage::parse(&[0xff; 4096]), Err(NodePageError::Empty));
+        assert_eq!(NodePage::parse(&good[..SIZE - 1]), Err(NodePageError::TooShort { length: SIZE - 1 }));
+        assert_eq!(NodePage::parse(&[0; SIZE]), Err(NodePageError::Magic));
+        let mut bytes = good;
+        bytes[8] = 2;
+        assert_eq!(NodePage::parse(&bytes), Err(NodePageError::Version { found: 2 }));
+        let mut bytes = good;
+        bytes[70] ^= 4;
+        assert!(matches!(NodePage::parse(&bytes), Err(NodePageError::Checksum { .. })));
+
+        let nan = f32::NAN.to_le_bytes();
+        let cases: [(usize, &[u8], &str); 14] = [
+            (10, &[8], "number of this module"),
+            (11, &[0], "number of modules"),
+            (11, &[65], "number of modules"),
+            (12, &[2], "choice after bus-off"),
+            (15, &[1], "reserved byte"),
+            (27, &[1], "reserved byte"),
+            (17, &[0x40], "zero of an encoder"),
+            (18, &[2], "direction of an encoder"),
+            (36, &nan, "mounting of the inertial sensor"),
+            (68, &0.0f32.to_le_bytes(), "torque constant"),
+            (100, &nan, "current limit"),
+            (104, &1.0f32.to_le_bytes(), "cut-off current"),
+            (112, &f32::INFINITY.to_le_bytes(), "winding inductance"),
+            (120, &(-0.1f32).to_le_bytes(), "zero of the current sense"),
+        ];
+        for (at, what, wanted) in cases {
+            let mut bytes = good;
+            bytes[at..at + what.len()].copy_from_slice(what);
+            match NodePage::parse(&mended(bytes)) {
+                Err(NodePageError::Value { field, .. }) => assert_eq!(field, wanted, "byte {at}"),
+                other => panic!("byte {at}: {other:?}"),
+            }
+        }
+    }
+
+    #[test]
+    fn a_mirror_is_no_rotation() {
+        let mut page = page();
+        page.calibration.imu_mounting[2][2] = -1.0;
+        let error = page.encode().unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "the node page has a mounting of the inertial sensor that cannot be: accepted is a rotation: orthonormal rows, right-handed"
+        );
+    }
+
+    proptest! {
+        /// Any damage is noticed, and nothing panics.
+        #[test]
+        fn damage_is_noticed(at in 0..SIZE, flip in 1u8..) {
+            let mut bytes = page().encode().unwrap();
+            bytes[at] ^= flip;
+            prop_assert!(NodePage::parse(&bytes).is_err());
+        }
+
+        #[test]
+        fn any_bytes_with_a_good_checksum(tail in proptest::collection::vec(any::<u8>(), SIZE - 10), length in 0..SIZE) {
+            let head: Vec<u8> = MAGIC.into_iter().chain(VERSION.to_le_bytes()).chain(tail).collect();
+            let bytes = mended(head.try_into().unwrap());
+            if let Ok(page) = NodePage::parse(&bytes) {
+                prop_assert_eq!(page.encode(), Ok(bytes));
+            }
+            prop_assert!(NodePage::parse(&bytes[..length]).is_err());
+        }
+    }
+}

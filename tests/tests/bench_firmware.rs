@@ -1,0 +1,36 @@
+//! `snakectl bench firmware`: the instructions that the README states, within bounds.
+
+#[path = "common/arm.rs"]
+#[allow(dead_code)] // The command under test runs the emulator.
+mod arm;
+mod common;
+
+use common::{json, refuse, succeed};
+
+#[test]
+fn the_kernels_are_as_fast_as_promised() {
+    let folder = tempfile::tempdir().unwrap();
+    let image = arm::image("composer-qemu-bench", "board-qemu");
+    let image = image.to_str().unwrap();
+    let counts = json(folder.path(), &["bench", "firmware", "--json", "--image", image]);
+    let count = |name: &str| counts[name].as_f64().unwrap_or_else(|| panic!("{name} is missing in {counts}"));
+    assert!(64.0 * 64.0 / count("dense64/dsp") >= 0.60, "{counts}");
+    assert!(count("dense64/portable") > 2.0 * count("dense64/dsp"), "{counts}");
+    // A control step of 50 ms at 170 MHz has 8.5 million cycles.
+    assert!(count("control_step/8/max") < 75_000.0 && count("control_step/64/max") < 300_000.0, "{counts}");
+    let table = succeed(folder.path(), &["bench", "firmware", "--image", image]);
+    for line in ["attention over 64 modules", "with the DSP extension", "framing, LATENT parsed", "1.5 cycles/insn"] {
+        assert!(table.contains(line), "{table}");
+    }
+}
+
+#[test]
+fn what_cannot_count_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    refuse(folder.path(), &["bench", "firmware", "--image", "nothing"], &["no image", "nothing", "cargo qemu-bench"]);
+    std::fs::write(folder.path().join("noise"), [0x5a; 100]).unwrap();
+    refuse(folder.path(), &["bench", "firmware", "--image", "noise"], &["noise", "failed"]);
+    // The image that compares finds nothing to compare, and says so.
+    let image = arm::image("composer-qemu-vectors", "board-qemu");
+    refuse(folder.path(), &["bench", "firmware", "--image", image.to_str().unwrap()], &["no file of cases"]);
+}
