@@ -3,11 +3,16 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use composer_host::env::EnvConfig;
+use composer_host::eval::{Pilot, Trial, healthy};
+use composer_host::recorder;
 use composer_host::replay::{
     Episode, FrameRecord, Look, Outline, Pose, Recording, Robot, Setting, Shape, Status, attention_bytes,
 };
+use composer_shared::policy::Task;
 
 const PERIOD: f32 = 0.05;
 const LINKS: usize = 4;
@@ -235,6 +240,46 @@ fn a_damaged_file_says_so() {
     let dom = open(&browser(), &path, "");
     assert_eq!(attribute(&dom, "data-ready"), Some("false"));
     assert!(dom.contains("This replay cannot be shown: Uncaught Error: its format 9 is not known"));
+}
+
+/// One page with an episode of every task, as the simulator records them, for a random policy.
+fn every_task() -> Recording {
+    let config = |task| {
+        let mut config = EnvConfig::new(task, composer_host::robot::Robot::default());
+        config.task.settings.cap = 20;
+        Arc::new(config)
+    };
+    let mut recording = recorder::recording(&config(Task::GoalReaching), "Every task", "random");
+    for task in Task::ALL {
+        let config = config(task);
+        let trial = Trial { config: &config, episodes: 1, seed: 1, faults: &healthy, threads: 1 };
+        trial.record(Pilot::Random, 1).into_iter().for_each(|episode| recording.push(episode));
+    }
+    recording
+}
+
+#[test]
+fn every_tasks_scene_opens() {
+    let browser = browser();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("replay.html");
+    every_task().write_html(&path).unwrap();
+    let words =
+        ["goal not reached", "block not at the goal", "shape not formed", "not through the tube", "not over the wall"];
+    for (index, (task, words)) in Task::ALL.into_iter().zip(words).enumerate() {
+        for view in ["", "&top", "&2d"] {
+            let dom = open(&browser, &path, &format!("#t=0.5&pause&episode={}{view}", index + 1));
+            let state = (attribute(&dom, "data-error"), attribute(&dom, "data-ready"), attribute(&dom, "data-fits"));
+            assert_eq!(state, (Some(""), Some("true"), Some("true")), "{task}{view}");
+            let body = &dom[..dom.find("id=\"recording\"").unwrap()];
+            assert!(body.contains(&format!("{}, 8 modules", task.title())) && body.contains(words), "{task}{view}");
+            // Labels in the scene, as far as they are shown.
+            let shown = |class: &str| body.matches(&format!("class=\"{class}\"")).count();
+            assert_eq!(shown("goal"), usize::from(task != Task::ShapeFormation), "{task}{view}");
+            assert_eq!(shown("num want"), if task == Task::ShapeFormation { 8 } else { 0 }, "{task}{view}");
+            assert_eq!(shown("mark"), if task == Task::TubeCrossing { 2 } else { 0 }, "{task}{view}");
+        }
+    }
 }
 
 /// A block that is pushed aside between a wall, a tube, a post and a wanted place; no goal, no attention, all relaxed.
