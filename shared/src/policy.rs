@@ -272,6 +272,15 @@ pub enum PolicyError {
     },
 }
 
+/// `[1, 2]`, without the code of `Debug`, which is large for a microcontroller.
+fn list(f: &mut fmt::Formatter<'_>, numbers: &[u16]) -> fmt::Result {
+    for (i, number) in numbers.iter().enumerate() {
+        f.write_str(if i == 0 { "[" } else { ", " })?;
+        write!(f, "{number}")?;
+    }
+    f.write_str("]")
+}
+
 impl fmt::Display for PolicyError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match *self {
@@ -287,11 +296,13 @@ impl fmt::Display for PolicyError {
                 "the policy image has layout version {found}, this build reads version {VERSION}: \
                  export the policy again"
             ),
-            Self::Dimensions { found } => write!(
-                f,
-                "the policy image holds a network of dimensions {found:?}, this build runs {DIMENSIONS:?} \
-                 (observation, embedding, key, value, hidden, action)"
-            ),
+            Self::Dimensions { found } => {
+                f.write_str("the policy image holds a network of dimensions ")?;
+                list(f, &found)?;
+                f.write_str(", this build runs ")?;
+                list(f, &DIMENSIONS)?;
+                f.write_str(" (observation, embedding, key, value, hidden, action)")
+            }
             Self::Length { stated } => {
                 write!(f, "the policy image says it is {stated} bytes long, layout version {VERSION} is {IMAGE_SIZE}")
             }

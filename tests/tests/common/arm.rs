@@ -13,10 +13,14 @@ pub fn image(program: &str, features: &str) -> PathBuf {
         .join("../firmware/Cargo.toml")
         .canonicalize()
         .expect("the firmware is beside the tests");
+    // Images of another room get a folder of their own: `cargo qemu-image` would otherwise find them in its place.
+    let folder = if features.contains("room-16") { "../target/room-16" } else { "../target" };
     let output = Command::new(env!("CARGO"))
         .args(["build", "--profile", "firmware", "--quiet", "--message-format=json", "--target", TARGET])
         .args(["--bin", program, "--features", features, "--manifest-path"])
         .arg(manifest)
+        .arg("--target-dir")
+        .arg(Path::new(env!("CARGO_MANIFEST_DIR")).join(folder))
         .output()
         .expect("cargo can be started");
     assert!(output.status.success(), "{program} does not build:\n{}", String::from_utf8_lossy(&output.stderr));
