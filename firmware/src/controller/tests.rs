@@ -287,7 +287,7 @@ fn the_torques_are_those_of_the_training_loop_to_the_last_bit() {
                 let told = Told { points, seeker: policy.task().seeker() };
                 policy.encode(&observe(&net.sensors[i], place(i, 5), &chain.head_seen_from(i), &told))
             });
-            let mut latents = [Default::default(); MAX_MODULES];
+            let mut latents = [Default::default(); ROOM];
             let mut plausible = 0;
             for i in 0..5 {
                 latents[i] = encoded[i].latent;

@@ -63,7 +63,7 @@ fn every_message_fits_and_arrives() {
         faults: FaultSet::default(),
         stats: full,
         // Weights are Q15, never more than 32767; these are the longest varints.
-        attention: Weights { all: [u16::MAX; MAX_MODULES], modules: 64 },
+        attention: Weights { all: [u16::MAX; ROOM], modules: ROOM as u8 },
     };
     assert_eq!(status.mode(), Some(Mode::Alone));
     let long = "x".repeat(TEXT_MAX);
