@@ -307,7 +307,7 @@ proptest! {
         for message in messages {
             prop_assert_eq!(Message::parse(&message.emit(module, fd)), Ok(message));
         }
-        let goal = Message::Goal(Goal::new(low, (low & 0x7f) as u8, Some([x[0], x[1], x[2]])));
+        let goal = Message::Goal(Goal::new(low, low & 0x7f, Some([x[0], x[1], x[2]])));
         prop_assert_eq!(Message::parse(&goal.emit(STATION, fd)), Ok(goal));
         prop_assert_eq!(LatentMessage::from_fragments(&latent.fragments().map(|f| f.data)), Ok(latent));
     }

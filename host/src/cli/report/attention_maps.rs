@@ -33,7 +33,7 @@ pub fn write(config: &RunConfig, network: &Network, path: &Path) -> Result<()> {
             }
         });
         let title = format!("{}: attention in a successful episode", config.task.name.title());
-        return Ok(write_whole(path, heatmaps(&maps.collect::<Vec<_>>(), &title).as_bytes())?);
+        return write_whole(path, heatmaps(&maps.collect::<Vec<_>>(), &title).as_bytes());
     }
     eprintln!("note: {} succeeded in none of {TRIED} episodes, so there is no attention figure", config.task.name);
     Ok(())
