@@ -21,8 +21,8 @@
 //! |---|---|
 //! | fully connected 64 x 64, requantised, with bias | 6,642, or 0.617 MAC an instruction |
 //! | the same, portable, the image compiled with `opt-level = 3` | 14,808, or 0.277 |
-//! | [`Policy::encode`](crate::policy::Policy::encode) | 14,765 |
-//! | [`Policy::attend`](crate::policy::Policy::attend) over 8, 16, 32, 64 modules | 3,626, 5,812, 10,089, 18,738 |
+//! | [`Policy::encode`](crate::policy::Policy::encode) | 16,265 |
+//! | [`Policy::attend`](crate::policy::Policy::attend) over 8, 16, 32, 64 modules | 3,645, 5,869, 10,317, 19,080 |
 //! | [`Policy::act`](crate::policy::Policy::act) without the attention | 14,107 |
 //!
 //! With int8 weights a load, two SXTB16 and two SMLAD make 4 products: 0.8 is the bound.
