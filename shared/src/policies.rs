@@ -1,12 +1,13 @@
 //! The policies that ship.
 
 /// Names of the policies that ship, those of their tasks.
-pub const NAMES: [&str; 1] = ["goal-reaching"];
+pub const NAMES: [&str; 2] = ["goal-reaching", "tube-crossing"];
 
 /// The image of a policy that ships.
 pub fn shipped(name: &str) -> Option<&'static [u8]> {
     match name {
         "goal-reaching" => Some(include_bytes!("../policies/goal-reaching.policy")),
+        "tube-crossing" => Some(include_bytes!("../policies/tube-crossing.policy")),
         _ => None,
     }
 }
