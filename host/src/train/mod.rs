@@ -519,13 +519,14 @@ pub fn config_of(checkpoint: &Checkpoint) -> Result<TrainConfig> {
 ///
 /// `fingerprint` says in the caller's words what is trained for (robot, task, difficulty); a checkpoint of another is refused. With
 /// `resume` the run in `out` goes on as if it had never stopped. Ctrl-C or SIGTERM ends the run with a checkpoint after the running
-/// iteration; a second one ends it at once.
+/// iteration; a second one ends it at once. A `name` tells the progress of runs that go on side by side apart.
 pub fn train(
     config: &TrainConfig,
     make: MakeEnvironment,
     fingerprint: &str,
     out: &Path,
     resume: bool,
+    name: Option<&str>,
     on_evaluate: Evaluate,
 ) -> Result<TrainSummary> {
     let began = Instant::now();
@@ -547,7 +548,7 @@ pub fn train(
     let mut metrics = Metrics::open(out, trainer.iteration(), trainer.steps()).with_context(cannot_log)?;
 
     let stop = Signals::new()?;
-    let mut progress = Progress::new(config.iterations() * config.steps_per_iteration(), trainer.steps());
+    let mut progress = Progress::new(config.iterations() * config.steps_per_iteration(), trainer.steps(), name);
     let mut saved = Instant::now();
     let mut evaluation = Vec::new();
     let mut interrupted = false;
@@ -600,14 +601,15 @@ pub fn train(
     })
 }
 
-/// Notices Ctrl-C and SIGTERM while it lives.
-struct Signals {
+/// Notices Ctrl-C and SIGTERM while it lives; the second one ends the process.
+pub(crate) struct Signals {
     flag: Arc<AtomicBool>,
     registered: Vec<signal_hook::SigId>,
 }
 
 impl Signals {
-    fn new() -> Result<Self> {
+    /// Starts to notice them.
+    pub(crate) fn new() -> Result<Self> {
         use signal_hook::consts::{SIGINT, SIGTERM};
         let flag = Arc::new(AtomicBool::new(false));
         let mut registered = Vec::new();
@@ -625,7 +627,8 @@ impl Signals {
         Ok(Self { flag, registered })
     }
 
-    fn raised(&self) -> bool {
+    /// Whether there was one.
+    pub(crate) fn raised(&self) -> bool {
         self.flag.load(Ordering::Relaxed)
     }
 }
@@ -694,7 +697,7 @@ mod tests {
         let quiet = |_: &Network, steps: u64| vec![("eval/steps".to_string(), steps as f64)];
         let config = TrainConfig { total_steps: 4 * 96, evaluate_every: 200, ..small(Method::Mappo) };
         let (a, b) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-        let whole = train(&config, make, "trivial", a.path(), false, &mut { quiet }).unwrap();
+        let whole = train(&config, make, "trivial", a.path(), false, None, &mut { quiet }).unwrap();
         assert_eq!((whole.steps, whole.iterations, whole.interrupted), (384, 4, false));
         assert_eq!(whole.evaluation, [("eval/steps".to_string(), 384.0)]);
 
@@ -703,7 +706,7 @@ mod tests {
         half.iterate().unwrap();
         half.iterate().unwrap();
         half.checkpoint().unwrap().write(b.path()).unwrap();
-        let resumed = train(&config, make, "trivial", b.path(), true, &mut { quiet }).unwrap();
+        let resumed = train(&config, make, "trivial", b.path(), true, None, &mut { quiet }).unwrap();
         assert_eq!(resumed.network, whole.network);
         assert_eq!(Checkpoint::read(a.path()).unwrap(), Checkpoint::read(b.path()).unwrap());
         let lines = std::fs::read_to_string(b.path().join(metrics::FILE)).unwrap();
@@ -734,7 +737,7 @@ mod tests {
 
         let folder = tempfile::tempdir().unwrap();
         let run = |resume| {
-            train(&config, &teams, "trivial", folder.path(), resume, &mut |_, _| Vec::new()).err().unwrap().to_string()
+            train(&config, &teams, "trivial", folder.path(), resume, None, &mut |_, _| Vec::new()).err().unwrap().to_string()
         };
         assert!(run(true).contains("holds no checkpoint"));
         checkpoint.write(folder.path()).unwrap();

@@ -7,6 +7,8 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 /// How often a plain line is printed.
 const EVERY: Duration = Duration::from_secs(10);
+/// The same for one of several runs.
+const EVERY_OF_SEVERAL: Duration = Duration::from_secs(30);
 
 /// Where the time of some iterations went, wall time on all cores but for the two parts of the rollout.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -49,15 +51,19 @@ impl Times {
 #[derive(Debug)]
 pub struct Progress {
     bar: Option<ProgressBar>,
+    /// Words before each plain line.
+    name: String,
+    every: Duration,
     total: u64,
     last: Instant,
     since: Times,
 }
 
 impl Progress {
-    /// For a run of `total` steps, of which `done` are done.
-    pub fn new(total: u64, done: u64) -> Self {
-        let bar = std::io::stderr().is_terminal().then(|| {
+    /// For a run of `total` steps, of which `done` are done. A run with a `name` is one of several at a time: they print lines with
+    /// their names, as their bars would overwrite each other.
+    pub fn new(total: u64, done: u64, name: Option<&str>) -> Self {
+        let bar = (name.is_none() && std::io::stderr().is_terminal()).then(|| {
             let bar = ProgressBar::new(total).with_position(done).with_elapsed(Duration::ZERO);
             if let Ok(style) =
                 ProgressStyle::with_template("{bar:30} {human_pos}/{human_len} steps, {eta} left | {msg}")
@@ -67,13 +73,15 @@ impl Progress {
             bar.reset_eta();
             bar
         });
-        Self { bar, total, last: Instant::now(), since: Times::default() }
+        let every = if name.is_some() { EVERY_OF_SEVERAL } else { EVERY };
+        let name = name.map(|name| format!("{name}: ")).unwrap_or_default();
+        Self { bar, name, every, total, last: Instant::now(), since: Times::default() }
     }
 
     /// After an iteration: `done` steps in all, its times, and the numbers worth watching.
     pub fn update(&mut self, done: u64, times: &Times, numbers: &[(&str, f64)]) {
         self.since.add(times);
-        let due = self.last.elapsed() >= EVERY;
+        let due = self.last.elapsed() >= self.every;
         if self.bar.is_none() && !due {
             return;
         }
@@ -92,7 +100,7 @@ impl Progress {
                 bar.set_position(done);
                 bar.set_message(message);
             }
-            None => eprintln!("{done} of {} steps, {message}", self.total),
+            None => eprintln!("{}{done} of {} steps, {message}", self.name, self.total),
         }
         if due {
             self.last = Instant::now();
@@ -104,7 +112,7 @@ impl Progress {
     pub fn say(&self, line: &str) {
         match &self.bar {
             Some(bar) => bar.println(line),
-            None => eprintln!("{line}"),
+            None => eprintln!("{}{line}", self.name),
         }
     }
 

@@ -4,7 +4,8 @@ mod attention_maps;
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
 
 use anyhow::{Context, Result, bail};
 use composer_shared::policy::Task;
@@ -17,19 +18,12 @@ use crate::files::{create_folder, write_whole};
 use crate::methods::Method;
 use crate::plot::{Axes, Panel, common_grid, mean_and_se, panels};
 use crate::run::{Knows, RunConfig};
+use crate::train::Signals;
 
 /// Seed of the final evaluations.
 const FINAL_SEED: u64 = 1;
 /// What a run's final evaluation is kept in.
 const RESULT_FILE: &str = "result.json";
-/// Faults of the final evaluations, and the table's headings for them.
-const FAULTS: [(&str, &str); 5] = [
-    ("none", "success"),
-    ("action:1", "one action"),
-    ("action:2", "two action"),
-    ("observation:1", "one observation"),
-    ("unplug:1", "one unplugged"),
-];
 
 /// Arguments of `report`.
 #[derive(clap::Args, Clone, Debug)]
@@ -44,14 +38,18 @@ pub struct Arguments {
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Environment steps of each run
-    #[arg(long, default_value_t = 300_000)]
+    #[arg(long, default_value_t = 250_000)]
     steps: u64,
     /// Seeds
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=100))]
     seeds: u64,
     /// Episodes of the evaluations at the end
-    #[arg(long, default_value_t = 200, value_parser = clap::value_parser!(u64).range(1..=100_000))]
+    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..=100_000))]
     episodes: u64,
+    /// Training runs side by side, each on its share of the cores: the fewer cores a run has, the less it waits for itself
+    /// [default: the cores]
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    jobs: Option<u64>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -69,6 +67,16 @@ impl What {
             What::Attention => "attention",
             What::Ablation => "ablation",
         }
+    }
+
+    /// Faults of the final evaluations, and the table's headings for them.
+    fn faults(self) -> Vec<(&'static str, &'static str)> {
+        let mut faults = vec![("none", "success"), ("unplug:1", "one unplugged")];
+        if self == What::Attention {
+            let more = [("action:1", "one action"), ("action:2", "two action"), ("observation:1", "one observation")];
+            faults.splice(1..1, more);
+        }
+        faults
     }
 
     /// What the panels of the figure differ in.
@@ -129,15 +137,17 @@ pub fn run(arguments: &Arguments) -> Result<()> {
                 config.train.seed = seed;
                 config.train.total_steps = arguments.steps;
                 config.train.evaluate_every = (arguments.steps / 10).max(1);
+                if what == What::Ablation {
+                    // Short runs, at the rate of the shipped policies; three seeds make 90 episodes a point.
+                    config.train.learning_rate = 7e-4;
+                    config.train.evaluation_episodes = 30;
+                }
                 runs.push(Run { folder: folder.join(format!("{method}-{name}-{seed}")), config, panel });
             }
         }
     }
-    for (number, run) in runs.iter().enumerate() {
-        eprintln!("run {} of {}: {}", number + 1, runs.len(), run.folder.display());
-        if !finish(run, arguments.episodes)? {
-            bail!("stopped; the same command goes on from here");
-        }
+    if !finish_all(what, &runs, arguments)? {
+        bail!("stopped; the same command goes on from here");
     }
     publish(what, &runs, arguments, &out)?;
     if what == What::Ablation {
@@ -153,18 +163,56 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     Ok(())
 }
 
-/// Trains and evaluates a run unless that is done. False: interrupted.
-fn finish(run: &Run, episodes: u64) -> Result<bool> {
+/// Trains and evaluates all runs, some at a time. False: interrupted.
+fn finish_all(what: What, runs: &[Run], arguments: &Arguments) -> Result<bool> {
+    let jobs = arguments.jobs.map_or_else(super::cores, |jobs| jobs as usize).min(runs.len());
+    let threads = (super::cores() / jobs).max(1);
+    let stop = Signals::new()?;
+    let next = AtomicUsize::new(0);
+    let failure = Mutex::new(None);
+    let worker = || {
+        while !stop.raised() && failure.lock().is_ok_and(|failure| failure.is_none()) {
+            let number = next.fetch_add(1, Ordering::Relaxed);
+            let Some(run) = runs.get(number) else { break };
+            eprintln!("run {} of {}: {}", number + 1, runs.len(), run.folder.display());
+            if let Err(error) = finish(what, run, arguments.episodes, threads)
+                && let Ok(mut failure) = failure.lock()
+            {
+                failure.get_or_insert(error);
+            }
+        }
+    };
+    std::thread::scope(|scope| {
+        for _ in 1..jobs {
+            scope.spawn(worker);
+        }
+        worker();
+    });
+    match failure.into_inner() {
+        Ok(Some(error)) => Err(error),
+        _ => Ok(!stop.raised()),
+    }
+}
+
+/// Trains and evaluates a run on `threads` threads unless that is done; interrupted, it leaves the rest to the next time.
+fn finish(what: What, run: &Run, episodes: u64, threads: usize) -> Result<()> {
     let result = run.folder.join(RESULT_FILE);
     let begun = run.folder.join(CONFIG_FILE).exists();
-    if begun && load_config(&run.folder.join(CONFIG_FILE))? != run.config {
-        bail!("{} holds a run with other settings; choose another --runs folder", run.folder.display());
+    let mut config = run.config.clone();
+    config.train.threads = threads;
+    if begun {
+        let mut was = load_config(&run.folder.join(CONFIG_FILE))?;
+        was.train.threads = threads;
+        if was != config {
+            bail!("{} holds a run with other settings; choose another --runs folder", run.folder.display());
+        }
     }
     if result.exists() {
-        return Ok(true);
+        return Ok(());
     }
-    if train_in(&run.config, &run.folder, begun)?.interrupted {
-        return Ok(false);
+    let name = run.folder.file_name().unwrap_or_default().to_string_lossy();
+    if train_in(&config, &run.folder, begun, Some(&name))?.interrupted {
+        return Ok(());
     }
     let (config, network) = load_run(&run.folder)?;
     let env = Arc::new(config.evaluation());
@@ -173,18 +221,17 @@ fn finish(run: &Run, episodes: u64) -> Result<bool> {
         episodes: episodes as usize,
         seed: FINAL_SEED,
         faults: &healthy,
-        threads: super::cores(),
+        threads,
     };
     let mut results = serde_json::Map::new();
-    for (fault, _) in FAULTS {
+    for (fault, _) in what.faults() {
         let plan: composer_sim_bridge::faults::FaultPlan =
             fault.parse().with_context(|| format!("the fault {fault}"))?;
         let draw = |seed, modules| plan.draw(seed, modules);
         let report = Trial { faults: &draw, ..trial }.evaluate(Pilot::Float(&network), fault, &|| {});
         results.insert(fault.into(), serde_json::to_value(report)?);
     }
-    write_whole(&result, serde_json::to_string_pretty(&results)?.as_bytes())?;
-    Ok(true)
+    write_whole(&result, serde_json::to_string_pretty(&results)?.as_bytes())
 }
 
 /// Success at each evaluation of a run: (environment steps, share).
@@ -205,8 +252,10 @@ fn curve(folder: &Path) -> Result<Vec<(f64, f64)>> {
 fn publish(what: What, runs: &[Run], arguments: &Arguments, out: &Path) -> Result<()> {
     let mut figure = Vec::new();
     let mut data = Vec::new();
-    let headings = FAULTS.map(|(_, heading)| heading).join(" | ");
-    let mut table = format!("| {} | method | {headings} | steps |\n|{}\n", what.panels_are(), "---|".repeat(8));
+    let faults = what.faults();
+    let headings: Vec<&str> = faults.iter().map(|(_, heading)| *heading).collect();
+    let rule = "---|".repeat(headings.len() + 3);
+    let mut table = format!("| {} | method | {} | steps |\n|{rule}\n", what.panels_are(), headings.join(" | "));
     for (panel, (_, words, _)) in what.panels().into_iter().enumerate() {
         let mut series = Vec::new();
         for (colour, method) in what.methods().into_iter().enumerate() {
@@ -233,8 +282,9 @@ fn publish(what: What, runs: &[Run], arguments: &Arguments, out: &Path) -> Resul
                 let variance = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
                 format!("{mean:.digits$} +- {:.digits$}", (variance / n).sqrt())
             };
-            let success = FAULTS.map(|(fault, _)| column(fault, "success_rate", 2)).join(" | ");
-            writeln!(table, "| {words} | {method} | {success} | {} |", column("none", "steps_mean", 1))?;
+            let success: Vec<String> = faults.iter().map(|(fault, _)| column(fault, "success_rate", 2)).collect();
+            let steps = column("none", "steps_mean", 1);
+            writeln!(table, "| {words} | {method} | {} | {steps} |", success.join(" | "))?;
         }
         let axes = Axes {
             title: if what == What::Attention { format!("Goal known to {words}") } else { words.into() },
