@@ -7,7 +7,7 @@
 //! | goal | `goal_distance` units beyond the block, within `goal_bearing` of the line from the head through the block |
 //! | reward `paper` | `-d(head, block) - d(block, goal)` |
 //! | left to do (`progress`) | `d(head, P) + 2 d(block, goal)`, where P is the place behind the block from which it is pushed |
-//! | success | `d(block, goal) < 1` unit (SomoGym's); ends the episode |
+//! | success | `d(block, goal) < 1.5` units; ends the episode |
 //! | points on the bus | 0: the goal, 1: the block's centre |
 //! | imagined distance | mean over the modules of `d(p'_i, P)` |
 //!
@@ -51,10 +51,10 @@ impl Default for BlockPushing {
             block_mass: 0.01,
             block_friction: 0.5,
             block_distance: [3.0, 6.0],
-            block_bearing: 30.0,
+            block_bearing: 20.0,
             goal_distance: [4.0, 8.0],
-            goal_bearing: 30.0,
-            success_distance: 1.0,
+            goal_bearing: 20.0,
+            success_distance: 1.5,
         }
     }
 }
