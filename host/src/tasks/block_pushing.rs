@@ -50,9 +50,9 @@ impl Default for BlockPushing {
             block_size: [2.0, 2.0, 1.0],
             block_mass: 0.01,
             block_friction: 0.5,
-            block_distance: [3.0, 6.0],
+            block_distance: [3.0, 5.0],
             block_bearing: 20.0,
-            goal_distance: [4.0, 8.0],
+            goal_distance: [3.0, 6.0],
             goal_bearing: 20.0,
             success_distance: 1.5,
         }

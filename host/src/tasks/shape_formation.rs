@@ -4,7 +4,7 @@
 //! |---|---|
 //! | start | straight, at rest, head at the origin, facing +x |
 //! | targets | one a module, a module's length apart along a curve: line, arc, C, S, U, ring or spiral, bent to either side; its middle up to `place` units from the snake's, turned by up to `heading` |
-//! | | targets lie at least 1.2 times the success distance from the modules, in the mean: the snake must move |
+//! | | targets lie at least 1.3 times the success distance from the modules, in the mean: the snake must move |
 //! | reward `paper` | `-sum_i d(module_i, target_i)` |
 //! | left to do (`progress`) | `sum_i d(module_i, target_i)` |
 //! | success | mean over the modules of `d(module_i, target_i)` < 1.5 units: the paper's sum is below `n d_g`; ends the episode |
@@ -24,7 +24,7 @@ use crate::robot::Robot;
 use crate::sim::{Scene, Snake};
 
 /// Targets lie at least this many times the success distance from the modules at the start, in the mean.
-const START_APART: f32 = 1.2;
+const START_APART: f32 = 1.3;
 
 /// Settings of the task.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
