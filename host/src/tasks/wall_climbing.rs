@@ -6,10 +6,13 @@
 //! | wall | across the way, its near face `wall_distance` units ahead of the head, turned by up to `wall_bearing`, too long to go round |
 //! | goal | behind the wall, so far that a straight snake with its head there has its tail over the wall |
 //! | reward `paper` | how far the head has come along the normal of the wall |
-//! | left to do (`progress`) | mean over the modules of the way left: to the foot of the wall, up, across, and down behind it |
+//! | left to do (`progress`) | mean over the modules of the way left: to the foot of the wall, up, across, and down behind it; no module counts as farther than those ahead of it |
 //! | success | the centre of the last link is behind the far face; ends the episode |
 //! | points on the bus | 0: the goal, 1: the foot of the near face, nearest to the head, 2: the middle of the top above it |
-//! | imagined distance | mean over the modules of the way left from `p'_i` |
+//! | imagined distance | what is left to do from `p'` |
+//!
+//! If each module's way counted for itself, a snake would lie down along the foot of the wall, which brings most modules most of
+//! their way, and never leave it.
 
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -154,9 +157,10 @@ impl Rules for WallClimbing {
         let (wall, robot) = (Wall::of(course), snake.robot());
         let module = robot.links_per_module as f32 * robot.link_length;
         let count = positions.len();
-        let left = positions.iter().enumerate().map(|(m, p)| {
-            // Where the module is when the tail is just over the wall and the snake is straight.
-            wall.left(*p, robot.link_radius, (count - m) as f32 * module)
+        let left = positions.iter().enumerate().scan(0.0f32, |most, (m, p)| {
+            // To where the module is when the tail is just over the wall and the snake is straight.
+            *most = most.max(wall.left(*p, robot.link_radius, (count - m) as f32 * module));
+            Some(*most)
         });
         left.sum::<f32>() / count.max(1) as f32
     }
