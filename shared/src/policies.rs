@@ -1,13 +1,16 @@
 //! The policies that ship.
 
 /// Names of the policies that ship, those of their tasks.
-pub const NAMES: [&str; 2] = ["goal-reaching", "tube-crossing"];
+pub const NAMES: [&str; 5] = ["goal-reaching", "block-pushing", "shape-formation", "tube-crossing", "wall-climbing"];
 
 /// The image of a policy that ships.
 pub fn shipped(name: &str) -> Option<&'static [u8]> {
     match name {
         "goal-reaching" => Some(include_bytes!("../policies/goal-reaching.policy")),
+        "block-pushing" => Some(include_bytes!("../policies/block-pushing.policy")),
+        "shape-formation" => Some(include_bytes!("../policies/shape-formation.policy")),
         "tube-crossing" => Some(include_bytes!("../policies/tube-crossing.policy")),
+        "wall-climbing" => Some(include_bytes!("../policies/wall-climbing.policy")),
         _ => None,
     }
 }

@@ -51,6 +51,15 @@ enum Verb {
     Dbc(dbc::Arguments),
 }
 
+/// Where `cargo qemu-image` and `cargo qemu-bench` put an image: in the same target folder as this program, which lies in
+/// `target/release` or, a test, below.
+fn built_image(name: &str) -> Option<std::path::PathBuf> {
+    let program = std::env::current_exe().ok()?;
+    let release = program.parent()?;
+    let target = if release.ends_with("deps") { release.parent()?.parent()? } else { release.parent()? };
+    Some(target.join("thumbv7em-none-eabihf").join(name))
+}
+
 /// Parses the command line, runs the verb, and reports an error as one sentence.
 pub fn main() -> ExitCode {
     // `snakectl ... | head` ends quietly when its reader does; without this the next print would panic.

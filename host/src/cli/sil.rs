@@ -82,7 +82,7 @@ impl Emulation {
         }
         let firmware = match &self.qemu_image {
             Some(file) => file.clone(),
-            None => built_image()
+            None => super::built_image("firmware/composer-qemu")
                 .context("it is not known where this program lies: say where the image is with --qemu-image")?,
         };
         let qemu = Qemu::new(&firmware, image, Duration::from_secs_f64(self.qemu_timeout))?;
@@ -95,14 +95,6 @@ impl Emulation {
         }
         Ok(Some(qemu))
     }
-}
-
-/// Where `cargo qemu-image` puts the image: in the same target folder as this program, which lies in `target/release` or, a test, below.
-fn built_image() -> Option<PathBuf> {
-    let program = std::env::current_exe().ok()?;
-    let release = program.parent()?;
-    let target = if release.ends_with("deps") { release.parent()?.parent()? } else { release.parent()? };
-    Some(target.join("thumbv7em-none-eabihf/firmware/composer-qemu"))
 }
 
 /// Arguments of `sil`.

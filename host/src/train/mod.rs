@@ -737,7 +737,10 @@ mod tests {
 
         let folder = tempfile::tempdir().unwrap();
         let run = |resume| {
-            train(&config, &teams, "trivial", folder.path(), resume, None, &mut |_, _| Vec::new()).err().unwrap().to_string()
+            train(&config, &teams, "trivial", folder.path(), resume, None, &mut |_, _| Vec::new())
+                .err()
+                .unwrap()
+                .to_string()
         };
         assert!(run(true).contains("holds no checkpoint"));
         checkpoint.write(folder.path()).unwrap();

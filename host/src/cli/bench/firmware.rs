@@ -7,9 +7,8 @@ use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
+use composer_sim_bridge::qemu::{PROGRAM, QemuError};
 
-/// The emulator.
-const PROGRAM: &str = "qemu-system-arm";
 /// What it emulates, and how it counts.
 const CONDITIONS: [&str; 11] = [
     "-M",
@@ -40,20 +39,12 @@ pub struct Arguments {
     json: bool,
 }
 
-/// Where `cargo qemu-bench` puts the image: in the same target folder as this program.
-fn built_image() -> Option<PathBuf> {
-    let program = std::env::current_exe().ok()?;
-    Some(program.parent()?.parent()?.join("thumbv7em-none-eabihf/firmware/composer-qemu-bench"))
-}
-
 /// Runs the image to its end.
 fn emulate(image: &PathBuf) -> Result<Output> {
     let mut command = Command::new(PROGRAM);
     command.args(CONDITIONS).arg("-kernel").arg(image).stdin(Stdio::null());
     let mut child = match command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn() {
-        Err(error) if error.kind() == ErrorKind::NotFound => bail!(
-            "{PROGRAM} is not installed: get it by `apt-get install qemu-system-arm` (Debian, Ubuntu) or `brew install qemu` (macOS)"
-        ),
+        Err(error) if error.kind() == ErrorKind::NotFound => return Err(QemuError::Missing.into()),
         started => started.with_context(|| format!("{PROGRAM} cannot be started"))?,
     };
     // It prints less than a pipe holds, so that nobody has to read along.
@@ -77,8 +68,10 @@ fn counts(text: &str) -> BTreeMap<&str, u64> {
 
 /// Runs the verb.
 pub fn run(arguments: &Arguments) -> Result<()> {
-    let default =
-        || built_image().context("it is not known where this program lies: say where the image is with --image");
+    let default = || {
+        super::super::built_image("composer-qemu-bench")
+            .context("it is not known where this program lies: say where the image is with --image")
+    };
     let image = arguments.image.clone().map_or_else(default, Ok)?;
     if !image.is_file() {
         bail!("there is no image that counts at {}: build it with `cargo qemu-bench`", image.display());

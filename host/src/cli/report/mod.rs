@@ -216,13 +216,7 @@ fn finish(what: What, run: &Run, episodes: u64, threads: usize) -> Result<()> {
     }
     let (config, network) = load_run(&run.folder)?;
     let env = Arc::new(config.evaluation());
-    let trial = Trial {
-        config: &env,
-        episodes: episodes as usize,
-        seed: FINAL_SEED,
-        faults: &healthy,
-        threads,
-    };
+    let trial = Trial { config: &env, episodes: episodes as usize, seed: FINAL_SEED, faults: &healthy, threads };
     let mut results = serde_json::Map::new();
     for (fault, _) in what.faults() {
         let plan: composer_sim_bridge::faults::FaultPlan =
