@@ -4,10 +4,10 @@
 //! |---|---|
 //! | start | straight, at rest, head at the origin, facing +x |
 //! | targets | one a module, a module's length apart along a curve: line, arc, C, S, U, ring or spiral, bent to either side; its middle up to `place` units from the snake's, turned by up to `heading` |
-//! | | targets lie at least 1.3 times the success distance from the modules, in the mean: the snake must move |
+//! | | targets lie at least 1.6 times the success distance from the modules, in the mean: the snake must move |
 //! | reward `paper` | `-sum_i d(module_i, target_i)` |
 //! | left to do (`progress`) | `sum_i d(module_i, target_i)` |
-//! | success | mean over the modules of `d(module_i, target_i)` < 1.5 units: the paper's sum is below `n d_g`; ends the episode |
+//! | success | mean over the modules of `d(module_i, target_i)` < 1.25 units: the paper's sum is below `n d_g`; ends the episode |
 //! | points on the bus | i: the target of module i |
 //! | imagined distance | Wasserstein distance between `p'` and the targets: the least mean distance over all assignments |
 //!
@@ -24,7 +24,7 @@ use crate::robot::Robot;
 use crate::sim::{Scene, Snake};
 
 /// Targets lie at least this many times the success distance from the modules at the start, in the mean.
-const START_APART: f32 = 1.3;
+const START_APART: f32 = 1.6;
 
 /// Settings of the task.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -42,7 +42,7 @@ pub struct ShapeFormation {
 
 impl Default for ShapeFormation {
     fn default() -> Self {
-        ShapeFormation { shapes: Shape::ALL.to_vec(), place: 1.25, heading: 25.0, success_distance: 1.5 }
+        ShapeFormation { shapes: Shape::ALL.to_vec(), place: 1.25, heading: 25.0, success_distance: 1.25 }
     }
 }
 
