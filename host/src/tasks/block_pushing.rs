@@ -161,7 +161,8 @@ mod tests {
                 let away = flat(block.position, [0.0; 3]);
                 assert!(away >= task.block_distance[0] - 1e-3 && away <= task.block_distance[1] + 1e-3, "{away}");
                 let further = flat(block.position, course.goal);
-                assert!((4.0 - 1e-3..=8.0 + 1e-3).contains(&further), "{further}");
+                let [least, most] = task.goal_distance;
+                assert!((least - 1e-3..=most + 1e-3).contains(&further), "{further}");
                 let snake = Snake::in_scene(&robot, &course.scene);
                 let (position, rotation) = snake.block().unwrap();
                 let cuboid = Cuboid::new(block.half, position, rotation);
