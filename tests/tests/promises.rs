@@ -109,6 +109,7 @@ fn a_comparison_is_made_from_nothing_and_what_is_done_is_not_done_again() {
     let report = |steps| {
         ["report", "attention", "--steps", steps, "--seeds", "1", "--episodes", "2", "--runs", "r", "--out", "o"]
     };
+    refuse(folder.path(), &[&report("2048")[..], &["--so-far"]].concat(), &["none of the 4 runs in r is done"]);
     let table = succeed(folder.path(), &report("2048"));
     for method in ["| mappo |", "| composer-no-imagination |"] {
         assert_eq!(table.matches(method).count(), 2, "{table}");

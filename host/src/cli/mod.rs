@@ -57,7 +57,7 @@ fn built_image(name: &str) -> Option<std::path::PathBuf> {
     let program = std::env::current_exe().ok()?;
     let release = program.parent()?;
     let target = if release.ends_with("deps") { release.parent()?.parent()? } else { release.parent()? };
-    Some(target.join("thumbv7em-none-eabihf").join(name))
+    Some(target.join("thumbv7em-none-eabihf/firmware").join(name))
 }
 
 /// Parses the command line, runs the verb, and reports an error as one sentence.

@@ -82,7 +82,7 @@ impl Emulation {
         }
         let firmware = match &self.qemu_image {
             Some(file) => file.clone(),
-            None => super::built_image("firmware/composer-qemu")
+            None => super::built_image("composer-qemu")
                 .context("it is not known where this program lies: say where the image is with --qemu-image")?,
         };
         let qemu = Qemu::new(&firmware, image, Duration::from_secs_f64(self.qemu_timeout))?;

@@ -130,7 +130,6 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let what = arguments.what;
     let folder = arguments.runs.clone().unwrap_or_else(|| Path::new("runs").join(what.name()));
     let out = arguments.out.clone().unwrap_or_else(|| Path::new("host/results").join(what.name()));
-    create_folder(&out)?;
     let mut runs = Vec::new();
     for seed in 1..=arguments.seeds {
         for (panel, (name, _, config)) in what.panels().into_iter().enumerate() {
@@ -138,8 +137,8 @@ pub fn run(arguments: &Arguments) -> Result<()> {
                 let mut config = config.clone();
                 config.train.method = method;
                 config.train.seed = seed;
-                let twice = u64::from(config.task.name == Task::BlockPushing);
-                config.train.total_steps = arguments.steps << twice;
+                let longer = if config.task.name == Task::BlockPushing { 2 } else { 1 };
+                config.train.total_steps = arguments.steps.saturating_mul(longer);
                 config.train.evaluate_every = (config.train.total_steps / 10).max(1);
                 if what == What::Ablation {
                     // Short runs, at the rate of the shipped policies; three seeds make 90 episodes a point.
@@ -155,8 +154,13 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     if arguments.so_far {
         let all = runs.len();
         runs.retain(|run| run.folder.join(RESULT_FILE).exists());
+        if runs.is_empty() {
+            bail!("none of the {all} runs in {} is done: without --so-far they are trained", folder.display());
+        }
         println!("{} of {all} runs are done\n", runs.len());
-    } else if !finish_all(what, &runs, arguments)? {
+    }
+    create_folder(&out)?;
+    if !arguments.so_far && !finish_all(what, &runs, arguments)? {
         bail!("stopped; the same command goes on from here");
     }
     publish(what, &runs, &out)?;
@@ -169,7 +173,8 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             attention_maps::write(&config, &network, &path)?;
         }
     }
-    println!("\nmean and standard error over {} seeds; written to {}", arguments.seeds, out.display());
+    let seeds = if arguments.so_far { "those".into() } else { arguments.seeds.to_string() };
+    println!("\nmean and standard error over {seeds} seeds; written to {}", out.display());
     Ok(())
 }
 
