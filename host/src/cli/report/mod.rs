@@ -22,6 +22,8 @@ use crate::train::Signals;
 
 /// Seed of the final evaluations.
 const FINAL_SEED: u64 = 1;
+/// Metrics of the imagination policy: its reward, and how far the modules are from where it wanted them.
+const IMAGINATION: [&str; 2] = ["imagination/reward", "imagination/follow_error"];
 /// What a run's final evaluation is kept in.
 const RESULT_FILE: &str = "result.json";
 
@@ -243,18 +245,36 @@ fn finish(what: What, run: &Run, episodes: u64, threads: usize) -> Result<()> {
     write_whole(&result, serde_json::to_string_pretty(&results)?.as_bytes())
 }
 
-/// Success at each evaluation of a run: (environment steps, share).
-fn curve(folder: &Path) -> Result<Vec<(f64, f64)>> {
+/// The metrics of a run, one object an iteration.
+fn metrics(folder: &Path) -> Result<Vec<Value>> {
     let path = folder.join("metrics.jsonl");
     let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
-    let mut points = vec![(0.0, 0.0)];
-    for line in text.lines() {
-        let line: Value = serde_json::from_str(line).with_context(|| format!("{} is damaged", path.display()))?;
-        if let (Some(x), Some(y)) = (line["global_step"].as_f64(), line["evaluation/success_rate"].as_f64()) {
-            points.push((x, y));
-        }
-    }
-    Ok(points)
+    text.lines()
+        .map(|line| serde_json::from_str(line).with_context(|| format!("{} is damaged", path.display())))
+        .collect()
+}
+
+/// Success at each evaluation of a run: (environment steps, share).
+fn curve(metrics: &[Value]) -> Vec<(f64, f64)> {
+    let evaluations = metrics
+        .iter()
+        .filter_map(|line| Some((line["global_step"].as_f64()?, line["evaluation/success_rate"].as_f64()?)));
+    std::iter::once((0.0, 0.0)).chain(evaluations).collect()
+}
+
+/// Mean of a metric over the last tenth of a run; none if it has no such metric.
+fn at_the_end(metrics: &[Value], key: &str) -> Option<f64> {
+    let last = metrics.len().div_ceil(10);
+    let values: Vec<f64> = metrics[metrics.len() - last..].iter().filter_map(|line| line[key].as_f64()).collect();
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+}
+
+/// Mean and standard error.
+fn spread(values: &[f64], digits: usize) -> String {
+    let n = values.len() as f64;
+    let mean = values.iter().sum::<f64>() / n;
+    let variance = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
+    format!("{mean:.digits$} +- {:.digits$}", (variance / n).sqrt())
 }
 
 /// Figure, table and data.
@@ -265,6 +285,7 @@ fn publish(what: What, runs: &[Run], out: &Path) -> Result<()> {
     let headings: Vec<&str> = faults.iter().map(|(_, heading)| *heading).collect();
     let rule = "---|".repeat(headings.len() + 3);
     let mut table = format!("| {} | method | {} | steps |\n|{rule}\n", what.panels_are(), headings.join(" | "));
+    let mut following = String::new();
     for (panel, (_, words, _)) in what.panels().into_iter().enumerate() {
         let mut series = Vec::new();
         for (colour, method) in what.methods().into_iter().enumerate() {
@@ -272,31 +293,38 @@ fn publish(what: What, runs: &[Run], out: &Path) -> Result<()> {
             if of.is_empty() {
                 continue;
             }
-            let curves = of.iter().map(|r| curve(&r.folder)).collect::<Result<Vec<_>>>()?;
+            let logs = of.iter().map(|r| metrics(&r.folder)).collect::<Result<Vec<_>>>()?;
+            let curves: Vec<_> = logs.iter().map(|log| curve(log)).collect();
             let mut mean = mean_and_se(&curves, &common_grid(&curves, 11));
             mean.name = method.name().into();
             mean.colour = colour;
             series.push(mean);
             let mut results = Vec::new();
-            for (run, curve) in of.iter().zip(&curves) {
+            let mut imagined = [Vec::new(), Vec::new()];
+            for ((run, log), curve) in of.iter().zip(&logs).zip(&curves) {
+                let [earned, missed] = IMAGINATION.map(|key| at_the_end(log, key));
+                imagined[0].extend(earned);
+                imagined[1].extend(missed);
                 let text = std::fs::read(run.folder.join(RESULT_FILE))?;
                 let result: Value = serde_json::from_slice(&text)?;
                 data.push(json!({
                     "method": method.name(), what.panels_are(): words, "seed": run.config.train.seed,
                     "environment_steps": run.config.train.total_steps, "curve": curve, "final": result,
+                    IMAGINATION[0]: earned, IMAGINATION[1]: missed,
                 }));
                 results.push(result);
             }
             let column = |fault: &str, key: &str, digits: usize| {
                 let values: Vec<f64> = results.iter().filter_map(|r| r[fault][key].as_f64()).collect();
-                let n = values.len() as f64;
-                let mean = values.iter().sum::<f64>() / n;
-                let variance = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
-                format!("{mean:.digits$} +- {:.digits$}", (variance / n).sqrt())
+                spread(&values, digits)
             };
             let success: Vec<String> = faults.iter().map(|(fault, _)| column(fault, "success_rate", 2)).collect();
             let steps = column("none", "steps_mean", 1);
             writeln!(table, "| {words} | {method} | {} | {steps} |", success.join(" | "))?;
+            if imagined.iter().all(|values| !values.is_empty()) {
+                let [earned, missed] = imagined.map(|values| spread(&values, 3));
+                writeln!(following, "| {words} | {method} | {earned} | {missed} |")?;
+            }
         }
         let axes = Axes {
             title: if what == What::Attention { format!("Goal known to {words}") } else { words.into() },
@@ -306,6 +334,15 @@ fn publish(what: What, runs: &[Run], out: &Path) -> Result<()> {
             y_range: Some((0.0, 1.0)),
         };
         figure.push(Panel { axes, series });
+    }
+    if !following.is_empty() {
+        let bound = RunConfig::default().train.imagination.bound;
+        write!(
+            table,
+            "\nImagination policies in the last tenth of training; units a control step, the imagined step is at most {bound} long:\n\n\
+             | {} | method | comes nearer by | missed by the modules by |\n|---|---|---|---|\n{following}",
+            what.panels_are()
+        )?;
     }
     write_whole(&out.join("learning-curves.svg"), panels(&figure).as_bytes())?;
     write_whole(&out.join("runs.json"), serde_json::to_string_pretty(&data)?.as_bytes())?;
