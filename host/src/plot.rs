@@ -83,14 +83,20 @@ pub fn mean_and_se(runs: &[Vec<(f64, f64)>], grid: &[f64]) -> Series {
         if values.is_empty() || values.len() < runs.len() {
             continue;
         }
-        let n = values.len() as f64;
-        let mean = values.iter().sum::<f64>() / n;
-        let variance = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
+        let (mean, se) = mean_and_error(&values);
         series.x.push(x);
         series.mean.push(mean);
-        series.se.push((variance / n).sqrt());
+        series.se.push(se);
     }
     series
+}
+
+/// Mean of some values and its standard error, as in [`mean_and_se`]; not a number if there are none.
+pub fn mean_and_error(values: &[f64]) -> (f64, f64) {
+    let n = values.len() as f64;
+    let mean = values.iter().sum::<f64>() / n;
+    let variance = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
+    (mean, (variance / n).sqrt())
 }
 
 fn interpolate(run: &[(f64, f64)], x: f64) -> Option<f64> {

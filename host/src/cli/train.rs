@@ -123,7 +123,7 @@ pub fn train_in(config: &RunConfig, out: &Path, resuming: bool, name: Option<&st
             episodes: config.train.evaluation_episodes.max(1) as usize,
             seed: EVALUATION_SEED,
             faults: &healthy,
-            threads: if config.train.threads == 0 { super::cores() } else { config.train.threads },
+            threads: config.train.threads(),
         };
         let report = trial.evaluate(Pilot::Float(network), "none", &|| {});
         let mut scalars = scalars(&report, "evaluation");

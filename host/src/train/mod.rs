@@ -114,6 +114,14 @@ impl Default for TrainConfig {
 }
 
 impl TrainConfig {
+    /// Threads to work on: those that are set, or one a core.
+    pub fn threads(&self) -> usize {
+        match self.threads {
+            0 => std::thread::available_parallelism().map_or(1, usize::from),
+            threads => threads,
+        }
+    }
+
     /// Says what is wrong with the settings, if anything is.
     pub fn validate(&self) -> Result<()> {
         let positive = [
@@ -354,10 +362,7 @@ impl Trainer {
     /// Collects and learns once.
     pub fn iterate(&mut self) -> Result<Report> {
         let began = Instant::now();
-        let threads = match self.config.threads {
-            0 => std::thread::available_parallelism().map_or(1, usize::from),
-            threads => threads,
-        };
+        let threads = self.config.threads();
         let policy = Inference::new(&self.control.layout, &self.control.actor);
         let settings = &self.config.imagination;
         let imagined_by = self.imagination.as_ref().map(|learner| Inference::new(&learner.layout, &learner.actor));

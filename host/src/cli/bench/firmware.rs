@@ -69,7 +69,7 @@ fn counts(text: &str) -> BTreeMap<&str, u64> {
 /// Runs the verb.
 pub fn run(arguments: &Arguments) -> Result<()> {
     let default = || {
-        super::super::built_image("composer-qemu-bench")
+        crate::cli::built_image("composer-qemu-bench")
             .context("it is not known where this program lies: say where the image is with --image")
     };
     let image = arguments.image.clone().map_or_else(default, Ok)?;

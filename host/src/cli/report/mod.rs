@@ -4,8 +4,8 @@ mod attention_maps;
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result, bail};
 use composer_shared::policy::Task;
@@ -13,10 +13,10 @@ use serde_json::{Value, json};
 
 use super::policy_file::{CONFIG_FILE, load_config, load_run};
 use super::train::train_in;
-use crate::eval::{Pilot, Trial, healthy};
+use crate::eval::{Pilot, Trial, healthy, parallel};
 use crate::files::{create_folder, write_whole};
 use crate::methods::Method;
-use crate::plot::{Axes, Panel, common_grid, mean_and_se, panels};
+use crate::plot::{Axes, Panel, common_grid, mean_and_error, mean_and_se, panels};
 use crate::run::{Knows, RunConfig};
 use crate::train::Signals;
 
@@ -76,12 +76,16 @@ impl What {
 
     /// Faults of the final evaluations, and the table's headings for them.
     fn faults(self) -> Vec<(&'static str, &'static str)> {
-        let mut faults = vec![("none", "success"), ("unplug:1", "one unplugged")];
-        if self == What::Attention {
-            let more = [("action:1", "one action"), ("action:2", "two action"), ("observation:1", "one observation")];
-            faults.splice(1..1, more);
+        match self {
+            What::Attention => vec![
+                ("none", "success"),
+                ("action:1", "one action"),
+                ("action:2", "two action"),
+                ("observation:1", "one observation"),
+                ("unplug:1", "one unplugged"),
+            ],
+            What::Ablation => vec![("none", "success"), ("unplug:1", "one unplugged")],
         }
-        faults
     }
 
     /// What the panels of the figure differ in.
@@ -185,30 +189,16 @@ fn finish_all(what: What, runs: &[Run], arguments: &Arguments) -> Result<bool> {
     let jobs = arguments.jobs.map_or_else(super::cores, |jobs| jobs as usize).min(runs.len());
     let threads = (super::cores() / jobs).max(1);
     let stop = Signals::new()?;
-    let next = AtomicUsize::new(0);
-    let failure = Mutex::new(None);
-    let worker = || {
-        while !stop.raised() && failure.lock().is_ok_and(|failure| failure.is_none()) {
-            let number = next.fetch_add(1, Ordering::Relaxed);
-            let Some(run) = runs.get(number) else { break };
-            eprintln!("run {} of {}: {}", number + 1, runs.len(), run.folder.display());
-            if let Err(error) = finish(what, run, arguments.episodes, threads)
-                && let Ok(mut failure) = failure.lock()
-            {
-                failure.get_or_insert(error);
-            }
+    let failed = AtomicBool::new(false);
+    let results = parallel(runs.len(), jobs, |number| {
+        if stop.raised() || failed.load(Ordering::Relaxed) {
+            return Ok(());
         }
-    };
-    std::thread::scope(|scope| {
-        for _ in 1..jobs {
-            scope.spawn(worker);
-        }
-        worker();
+        eprintln!("run {} of {}: {}", number + 1, runs.len(), runs[number].folder.display());
+        finish(what, &runs[number], arguments.episodes, threads).inspect_err(|_| failed.store(true, Ordering::Relaxed))
     });
-    match failure.into_inner() {
-        Ok(Some(error)) => Err(error),
-        _ => Ok(!stop.raised()),
-    }
+    results.into_iter().collect::<Result<()>>()?;
+    Ok(!stop.raised())
 }
 
 /// Trains and evaluates a run on `threads` threads unless that is done; interrupted, it leaves the rest to the next time.
@@ -266,15 +256,13 @@ fn curve(metrics: &[Value]) -> Vec<(f64, f64)> {
 fn at_the_end(metrics: &[Value], key: &str) -> Option<f64> {
     let last = metrics.len().div_ceil(10);
     let values: Vec<f64> = metrics[metrics.len() - last..].iter().filter_map(|line| line[key].as_f64()).collect();
-    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+    (!values.is_empty()).then(|| mean_and_error(&values).0)
 }
 
 /// Mean and standard error.
 fn spread(values: &[f64], digits: usize) -> String {
-    let n = values.len() as f64;
-    let mean = values.iter().sum::<f64>() / n;
-    let variance = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
-    format!("{mean:.digits$} +- {:.digits$}", (variance / n).sqrt())
+    let (mean, se) = mean_and_error(values);
+    format!("{mean:.digits$} +- {se:.digits$}")
 }
 
 /// Figure, table and data.
