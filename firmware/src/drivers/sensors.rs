@@ -15,7 +15,7 @@ use super::imu::{ImuError, Lsm6dso, Motion};
 pub const HOLD: u8 = 4;
 
 /// Bandwidth of the speed estimate, rad/s: 25 Hz, two and a half times what a control period of 50 ms can use.
-const SPEED_BANDWIDTH: f32 = 157.0;
+pub const SPEED_BANDWIDTH: f32 = 157.0;
 
 /// A joint with its encoder.
 #[derive(Debug)]
