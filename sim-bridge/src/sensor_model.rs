@@ -401,3 +401,166 @@ fn wrap(angle: f32) -> f32 {
         angle
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use composer_firmware::drivers::encoder::SpeedEstimator;
+
+    const LEVEL: Truth = Truth {
+        joint_angles: [0.1, -0.2, 0.3, 0.0],
+        joint_speeds: [0.0; MAX_JOINTS],
+        joints: 3,
+        specific_force: [0.0, 0.0, 1.0],
+        angular_rate: [0.0; 3],
+    };
+
+    fn spread(values: &[f32]) -> (f32, f32) {
+        let mean = values.iter().sum::<f32>() / values.len() as f32;
+        (mean, (values.iter().map(|v| (v - mean).powi(2)).sum::<f32>() / values.len() as f32).sqrt())
+    }
+
+    #[test]
+    fn without_a_model_the_truth_is_read() {
+        let mut state = ModuleSensorState::new(&SensorModel::none(), 1);
+        let truth = Truth { joint_speeds: [1.0, -2.0, 3.0, 0.0], angular_rate: [0.1, 0.2, 50.0], ..LEVEL };
+        let raw = state.sample(&truth);
+        assert_eq!((raw.joint_angles, raw.joint_speeds), (truth.joint_angles, truth.joint_speeds));
+        assert_eq!((raw.specific_force, raw.angular_rate), (truth.specific_force, truth.angular_rate));
+        assert!(!state.sensors([0.0; 2], 25.0).plausible(), "nothing was read yet");
+        state.rest(&LEVEL);
+        let sensors = state.sensors([0.5, 0.0], 25.0);
+        assert_eq!((sensors.up, sensors.torque), ([0.0, 0.0, 1.0], [0.5, 0.0]));
+        assert!(sensors.plausible());
+    }
+
+    #[test]
+    fn the_same_seed_gives_the_same_bits() {
+        let run = |seed| {
+            let mut state = ModuleSensorState::new(&SensorModel::default(), seed);
+            state.rest(&LEVEL);
+            (0..100).for_each(|_| state.update(&LEVEL));
+            state.sensors([0.0; 2], 25.0)
+        };
+        assert_eq!(run(7), run(7));
+        assert_ne!(run(7), run(8));
+    }
+
+    #[test]
+    fn noise_offsets_steps_and_ranges_are_those_of_the_datasheets() {
+        let model = SensorModel::default();
+        let mut offsets = Vec::new();
+        for seed in 0..200 {
+            let mut state = ModuleSensorState::new(&model, seed);
+            let raws: Vec<Raw> = (0..2000).map(|_| state.sample(&LEVEL)).collect();
+            let axis = |f: &dyn Fn(&Raw) -> f32| spread(&raws.iter().map(f).collect::<Vec<_>>());
+            let (force, force_noise) = axis(&|raw| raw.specific_force[0]);
+            let (rate, rate_noise) = axis(&|raw| raw.angular_rate[1].to_degrees());
+            let (_, angle_noise) = axis(&|raw| raw.joint_angles[1].to_degrees());
+            // 75 ug and 3.8 mdps over 50 Hz, with the steps.
+            assert!((force_noise / 0.53e-3 - 1.0).abs() < 0.1, "{force_noise}");
+            assert!((rate_noise / 0.0335 - 1.0).abs() < 0.2, "{rate_noise}");
+            assert!((angle_noise / 0.068 - 1.0).abs() < 0.1, "{angle_noise}");
+            offsets.push([force, rate]);
+        }
+        let [force, rate] = [0, 1].map(|i| spread(&offsets.iter().map(|o| o[i]).collect::<Vec<_>>()).1);
+        assert!((force / 0.02 - 1.0).abs() < 0.2 && (rate - 1.0).abs() < 0.2, "{force} {rate}");
+
+        let mut state = ModuleSensorState::new(&model, 1);
+        let violent = Truth { specific_force: [9.0, -9.0, 1.0], angular_rate: [50.0, -50.0, 0.0], ..LEVEL };
+        let raw = state.sample(&violent);
+        assert!((raw.specific_force[0] - 4.0).abs() < 1e-3 && (raw.specific_force[1] + 4.0).abs() < 1e-3, "{raw:?}");
+        assert!((raw.angular_rate[0] - 40.0).abs() < 0.1 && (raw.angular_rate[1] + 40.0).abs() < 0.1, "{raw:?}");
+        let steps = raw.joint_angles[0] / TAU * f32::from(STEPS);
+        assert!((steps - steps.round()).abs() < 1e-2 && raw.joint_angles[3] == 0.0, "{raw:?}");
+        let steps = raw.specific_force[2] / 0.122e-3;
+        assert!((steps - steps.round()).abs() < 1e-2, "{raw:?}");
+    }
+
+    /// The speed of a swinging joint, from a hundred samples a second here and from a thousand through the board's own code.
+    #[test]
+    fn the_speed_is_that_of_the_board() {
+        let quiet = Encoder { noise: 0.0, zero: 0.0, nonlinearity: 0.0, bits: 0, tracking: true };
+        let angle = |time: f32| 0.8 * (TAU * 0.7 * time).sin() + 0.2 * (TAU * 3.0 * time).cos();
+        for (encoder, noisy) in [(quiet, false), (Encoder { zero: 0.0, nonlinearity: 0.0, ..Encoder::default() }, true)]
+        {
+            let mut here = ModuleSensorState::new(&SensorModel { encoder, ..SensorModel::none() }, 5);
+            let mut board = SpeedEstimator::new(SPEED_BANDWIDTH);
+            let mut random = Random(9);
+            let (mut apart, mut rough_here, mut rough_board) = (Vec::new(), Vec::new(), Vec::new());
+            here.rest(&Truth { joint_angles: [angle(0.0); 4], ..LEVEL });
+            board.update(angle(0.0), 1e-3);
+            for period in 1..=2000 {
+                let time = period as f32 * PERIOD;
+                let mut speed = 0.0;
+                for k in 1..=10 {
+                    let noise = if noisy { encoder.noise.to_radians() * random.normal() } else { 0.0 };
+                    speed = board.update(angle(time - PERIOD + 1e-3 * k as f32) + noise, 1e-3);
+                }
+                here.update(&Truth { joint_angles: [angle(time); 4], ..LEVEL });
+                let own = here.sensors([0.0; 2], 25.0).joint_speeds[0];
+                let lag = time - 2.0 / SPEED_BANDWIDTH;
+                let truth = (angle(lag + 1e-3) - angle(lag - 1e-3)) / 2e-3;
+                if period > 20 {
+                    apart.push(own - speed);
+                    rough_here.push(own - truth);
+                    rough_board.push(speed - truth);
+                }
+            }
+            let [apart, rough_here, rough_board] = [apart, rough_here, rough_board].map(|v| spread(&v).1);
+            if noisy {
+                assert!((0.7..1.3).contains(&(rough_here / rough_board)), "{rough_here} {rough_board}");
+            } else {
+                assert!(apart < 0.08, "{apart}; {rough_here} {rough_board}");
+            }
+            println!("noisy {noisy}: {apart} rad/s apart; here {rough_here}, board {rough_board}");
+        }
+    }
+
+    #[test]
+    fn the_speed_does_not_jump_where_the_angle_turns_over() {
+        let mut state = ModuleSensorState::new(&SensorModel::default(), 3);
+        for period in 0..2000 {
+            let angle = wrap((0.02 * period as f32) % TAU);
+            state.update(&Truth { joint_angles: [angle; 4], ..LEVEL });
+            let speed = state.sensors([0.0; 2], 25.0).joint_speeds[0];
+            assert!(period < 10 || (speed - 2.0).abs() < 0.5, "{period}: {speed}");
+        }
+    }
+
+    #[test]
+    fn finer_physics_gives_the_same_means() {
+        let mut mean = Mean::default();
+        for k in 0..4 {
+            mean.add([k as f32, 0.0, 1.0], [0.0, 2.0 * k as f32, 0.0], 0.0025);
+        }
+        let (force, rate) = mean.take();
+        assert!((force[0] - 1.5).abs() < 1e-6 && (force[2] - 1.0).abs() < 1e-6 && (rate[1] - 3.0).abs() < 1e-6);
+        assert_eq!(mean.take(), ([0.0; 3], [0.0; 3]));
+    }
+
+    #[test]
+    fn up_is_right_within_the_offsets() {
+        let mut worst = 0.0f32;
+        for seed in 0..100 {
+            let mut state = ModuleSensorState::new(&SensorModel::default(), seed);
+            state.rest(&LEVEL);
+            for _ in 0..1000 {
+                state.update(&LEVEL);
+                let [x, y, z] = state.sensors([0.0; 2], 25.0).up;
+                worst = worst.max(x.hypot(y).atan2(z).to_degrees());
+            }
+        }
+        println!("{worst} degrees");
+        assert!(worst < 6.0, "{worst}");
+    }
+
+    #[test]
+    fn settings_are_checked() {
+        assert_eq!(SensorModel::default().check(), Ok(()));
+        assert_eq!(SensorModel::none().check(), Ok(()));
+        let mut model = SensorModel::default();
+        model.gyroscope.offset = f32::NAN;
+        assert!(model.check().is_err_and(|e| e.contains("gyroscope.offset")));
+    }
+}
