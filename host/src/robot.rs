@@ -6,6 +6,7 @@
 use std::path::Path;
 
 use composer_shared::robot::{Geometry, Limits, MAX_JOINTS, MAX_MODULES};
+use composer_sim_bridge::sensor_model::PERIOD;
 use serde::{Deserialize, Serialize};
 
 /// The paper's robot, and the default of every command.
@@ -204,8 +205,12 @@ impl Robot {
         if !(self.damping >= 0.0 && self.damping.is_finite()) {
             return invalid(format!("damping = {}; it must be zero or more", self.damping));
         }
-        if self.physics_step > 0.02 {
-            return invalid(format!("physics_step = {}; above 0.02 s fast links turn too far in a step", self.physics_step));
+        let in_a_sample = PERIOD / self.physics_step;
+        if in_a_sample < 0.999 || (in_a_sample - in_a_sample.round()).abs() > 1e-3 * in_a_sample {
+            return invalid(format!(
+                "physics_step = {}; it must be {PERIOD} s, at which the sensors sample, or a whole part of it",
+                self.physics_step
+            ));
         }
         if !(4..=1000).contains(&self.solver_iterations) {
             return invalid(format!("solver_iterations = {}; 4 to 1000 are possible", self.solver_iterations));

@@ -15,6 +15,7 @@
 
 use composer_shared::observation::Sensors;
 use composer_shared::robot::{self, AXES, Geometry, MAX_JOINTS};
+use composer_sim_bridge::sensor_model::{Mean, ModuleSensorState, PERIOD, SensorModel, Truth};
 use rapier3d::math::{Pose, Rotation, Vector};
 
 use crate::robot::{Robot, Solver};
@@ -27,6 +28,9 @@ pub mod scene;
 
 pub use chain::Effort;
 pub use scene::Scene;
+
+/// Temperature of the motors, which is not simulated, degrees Celsius.
+const AMBIENT: f32 = 25.0;
 
 /// Extremes of the motion, for the sanity of what was learnt.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -90,6 +94,14 @@ enum Engine {
     Mirror,
 }
 
+/// The sensors of one module, and what they felt since their last sample.
+struct Suite {
+    sensors: ModuleSensorState,
+    mean: Mean,
+    /// Velocity of the own link after the last physics step.
+    velocity: Vector,
+}
+
 /// The snake and its scene.
 pub struct Snake {
     robot: Robot,
@@ -101,6 +113,10 @@ pub struct Snake {
     motion: Motion,
     block_mass: f32,
     block_moments: [f32; 3],
+    /// Sensors as their datasheets have them; without, a module senses the truth.
+    suites: Vec<Suite>,
+    /// Physics steps since the sensors were fitted.
+    steps: usize,
 }
 
 impl Snake {
@@ -147,9 +163,59 @@ impl Snake {
             motion: Motion::default(),
             block_mass: scene.block.map_or(0.0, |b| b.mass),
             block_moments: scene.block.map_or([0.0; 3], |b| b.moments()),
+            suites: Vec::new(),
+            steps: 0,
         };
         snake.read();
         snake
+    }
+
+    /// Fits every module with sensors that have noise, offsets and filters, drawn with `seed`, after a rest where the snake is now.
+    pub fn fit_sensors(&mut self, model: &SensorModel, seed: u64) {
+        self.steps = 0;
+        self.suites = (0..self.robot.modules)
+            .map(|module| {
+                let mut sensors = ModuleSensorState::new(model, crate::methods::mix(seed ^ (module as u64) << 32));
+                let force = self.own_link(module).seen([0.0, 0.0, 1.0]);
+                sensors.rest(&self.truth(module, force, [0.0; 3]));
+                Suite { sensors, mean: Mean::default(), velocity: Vector::ZERO }
+            })
+            .collect();
+    }
+
+    /// What there is to sense of a module: its joints now, and the specific force (g) and angular rate (rad/s) it felt.
+    fn truth(&self, module: usize, specific_force: [f32; 3], angular_rate: [f32; 3]) -> Truth {
+        let links = self.robot.links_per_module;
+        let mut truth = Truth { specific_force, angular_rate, ..Truth::default() };
+        for k in 0..links.min(MAX_JOINTS) {
+            let index = module * links + k;
+            if index < self.state.joint_angles.len() {
+                truth.joint_angles[k] = self.state.joint_angles[index];
+                truth.joint_speeds[k] = self.state.joint_speeds[index];
+                truth.joints = k + 1;
+            }
+        }
+        truth
+    }
+
+    /// Lets the sensors feel the last physics step, and sample when it is time.
+    fn sense(&mut self) {
+        let (dt, gravity) = (self.robot.physics_step, self.robot.gravity);
+        self.steps += 1;
+        let sample = self.steps.is_multiple_of((PERIOD / dt).round().max(1.0) as usize);
+        for module in 0..self.suites.len() {
+            let own = *self.own_link(module);
+            let suite = &mut self.suites[module];
+            let velocity = Vector::from(own.linear);
+            let force = ((velocity - suite.velocity) / dt + gravity * Vector::Z) / gravity;
+            suite.velocity = velocity;
+            suite.mean.add(own.seen(force.to_array()), own.seen(own.angular), dt);
+            if sample {
+                let (force, rate) = suite.mean.take();
+                let truth = self.truth(module, force, rate);
+                self.suites[module].sensors.update(&truth);
+            }
+        }
     }
 
     /// The robot.
@@ -218,6 +284,9 @@ impl Snake {
         for speed in &self.state.joint_speeds {
             motion.peak_joint_speed = motion.peak_joint_speed.max(speed.abs());
         }
+        if !self.suites.is_empty() {
+            self.sense();
+        }
     }
 
     /// Where everything is, and how it moves.
@@ -261,22 +330,22 @@ impl Snake {
         self.state.links[self.state.links.len() - 1].position
     }
 
-    /// One sample of a module's sensors.
+    /// What a module's sensors say: their last sample, or the truth if none were fitted.
     pub fn sensors(&self, module: usize) -> Sensors {
-        let links = self.robot.links_per_module;
-        let mut sensors = Sensors { temperature: 25.0, ..Sensors::ZERO };
-        for k in 0..links.min(MAX_JOINTS) {
-            let index = module * links + k;
-            if index < self.state.joint_angles.len() {
-                sensors.joint_angles[k] = self.state.joint_angles[index];
-                sensors.joint_speeds[k] = self.state.joint_speeds[index];
-            }
+        let torque = self.torque[module].map(|t| t / self.robot.torque_limit);
+        if let Some(suite) = self.suites.get(module) {
+            return suite.sensors.sensors(torque, AMBIENT);
         }
         let own = self.own_link(module);
-        sensors.up = own.seen([0.0, 0.0, 1.0]);
-        sensors.angular_rate = own.seen(own.angular);
-        sensors.torque = self.torque[module].map(|t| t / self.robot.torque_limit);
-        sensors
+        let truth = self.truth(module, [0.0; 3], [0.0; 3]);
+        Sensors {
+            joint_angles: truth.joint_angles,
+            joint_speeds: truth.joint_speeds,
+            up: own.seen([0.0, 0.0, 1.0]),
+            angular_rate: own.seen(own.angular),
+            torque,
+            temperature: AMBIENT,
+        }
     }
 
     fn own_link(&self, module: usize) -> &LinkState {
