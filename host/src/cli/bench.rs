@@ -179,7 +179,11 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             way.milliseconds.sort_by(|a, b| a[part].total_cmp(&b[part]));
             format!("{:.0} ({:.0})", way.milliseconds[way.milliseconds.len() / 2][part], way.milliseconds[0][part])
         });
-        println!("{:>12} {:>8} {inference:>16} {update:>16}", format!("{:?}", way.gradient).to_lowercase(), way.threads);
+        println!(
+            "{:>12} {:>8} {inference:>16} {update:>16}",
+            format!("{:?}", way.gradient).to_lowercase(),
+            way.threads
+        );
     }
     if let Ok(PolicySource::Image(image)) = PolicySource::load("goal-reaching") {
         println!("\ncontrollers on the CAN-FD bus (1M/5M) with physics, one thread");

@@ -222,7 +222,13 @@ vectorise! {
 }
 
 #[inline(always)]
-fn attend_body<V: Vector>(latent: &[f32], heard: &[u64], modules: &[usize], attention: &mut [f32], context: &mut [f32]) {
+fn attend_body<V: Vector>(
+    latent: &[f32],
+    heard: &[u64],
+    modules: &[usize],
+    attention: &mut [f32],
+    context: &mut [f32],
+) {
     let (latent, context) = (latent.as_chunks::<LATENT>().0, context.as_chunks_mut::<VALUE>().0);
     let scale = (KEY as f32).sqrt().recip();
     let (mut first, mut at) = (0, 0);

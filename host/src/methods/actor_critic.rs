@@ -281,17 +281,8 @@ impl Batch {
 
     /// Empties the batch and keeps its memory.
     pub fn clear(&mut self) {
-        let Self {
-            modules,
-            observations,
-            privileged,
-            heard,
-            weights,
-            actions,
-            log_probabilities,
-            advantages,
-            targets,
-        } = self;
+        let Self { modules, observations, privileged, heard, weights, actions, log_probabilities, advantages, targets } =
+            self;
         modules.clear();
         heard.clear();
         for numbers in [observations, privileged, weights, actions, log_probabilities, advantages, targets] {

@@ -2,9 +2,7 @@
 
 use composer_shared::observation::SIZE;
 
-use super::actor_critic::{
-    Batch, CriticLayout, EMBED, Gradient, HIDDEN, room, transpose, transpose_back,
-};
+use super::actor_critic::{Batch, CriticLayout, EMBED, Gradient, HIDDEN, room, transpose, transpose_back};
 use super::kernels::{Start, bias_tanh_backward, dense, dense_weights, head, head_backward, tanh};
 use crate::environment::PRIVILEGED;
 

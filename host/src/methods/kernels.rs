@@ -34,7 +34,10 @@ pub fn dense(x: &[f32], inputs: usize, w: &[f32], start: Start, y: &mut [f32]) {
         Start::Bias(bias) => (&bias[..outputs], 0),
         Start::Sum => (&[][..], outputs),
     };
-    product(Product { a: x, a_row: inputs, a_step: 1, b: w, steps: inputs, start, start_stride, rows, columns: outputs }, y);
+    product(
+        Product { a: x, a_row: inputs, a_step: 1, b: w, steps: inputs, start, start_stride, rows, columns: outputs },
+        y,
+    );
 }
 
 /// `of_w += x^T of_y`, the gradient of a layer's weights, one row per input: `x` is `[rows][inputs]`, `of_y` is `[rows][outputs]`, `of_w`
@@ -45,7 +48,17 @@ pub fn dense_weights(x: &[f32], inputs: usize, of_y: &[f32], of_w: &mut [f32]) {
     assert!(x.len() == rows * inputs && of_w.len() == inputs * outputs && of_y.len() == rows * outputs);
     let (start, start_stride) = (&[][..], outputs);
     product(
-        Product { a: x, a_row: 1, a_step: inputs, b: of_y, steps: rows, start, start_stride, rows: inputs, columns: outputs },
+        Product {
+            a: x,
+            a_row: 1,
+            a_step: inputs,
+            b: of_y,
+            steps: rows,
+            start,
+            start_stride,
+            rows: inputs,
+            columns: outputs,
+        },
         of_w,
     );
 }
@@ -325,7 +338,17 @@ mod tests {
         }
         let a: Vec<f32> = (0..13 * 40).map(|i| (i as f32 * 0.7).sin()).collect();
         let b: Vec<f32> = (0..40 * 64).map(|i| (i as f32 * 0.3).cos()).collect();
-        let p = Product { a: &a, a_row: 40, a_step: 1, b: &b, steps: 40, start: &ZERO[..64], start_stride: 0, rows: 13, columns: 64 };
+        let p = Product {
+            a: &a,
+            a_row: 40,
+            a_step: 1,
+            b: &b,
+            steps: 40,
+            start: &ZERO[..64],
+            start_stride: 0,
+            rows: 13,
+            columns: 64,
+        };
         let [mut one, mut other] = [vec![0.0; 13 * 64], vec![0.0; 13 * 64]];
         // SAFETY: the processor has both.
         unsafe {

@@ -18,9 +18,9 @@ pub(crate) mod simd;
 
 use std::sync::{Arc, Mutex};
 
-use rayon::iter::{IntoParallelRefMutIterator, ParallelIterator};
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use rayon::iter::{IntoParallelRefMutIterator, ParallelIterator};
 use serde::{Deserialize, Serialize};
 
 /// How a policy is built and trained.

@@ -376,8 +376,7 @@ fn update_within<const A: usize>(
                 critic.load(critic_parameters);
                 (sum.loss, norm)
             };
-            let (of_actor, of_critic) =
-                workers.join(|| with_actor.then(actor_step), || with_critic.then(critic_step));
+            let (of_actor, of_critic) = workers.join(|| with_actor.then(actor_step), || with_critic.then(critic_step));
             if let Some((loss, kl, clipped, norm)) = of_actor {
                 stats.approx_kl = kl;
                 if actor_count == 0.0 {
@@ -532,9 +531,7 @@ mod tests {
 
     fn critic_values(parameters: &[f32], batch: &Batch) -> Vec<f32> {
         let mut scratch = CriticScratch::default();
-        Critic::new(parameters)
-            .values(&batch.observations, &batch.privileged, &batch.modules, &mut scratch)
-            .to_vec()
+        Critic::new(parameters).values(&batch.observations, &batch.privileged, &batch.modules, &mut scratch).to_vec()
     }
 
     fn actor_gradient(layout: ActorLayout, parameters: &[f32], batch: &Batch) -> Gradient {
@@ -743,10 +740,8 @@ mod tests {
                 imagination,
                 experience: Experience { lanes, control: mut of_control, imagination: mut of_imagination },
             } = rollout(method);
-            let batches = [
-                (&control, shaken(&lanes, &mut of_control)),
-                (&imagination, shaken(&lanes, &mut of_imagination)),
-            ];
+            let batches =
+                [(&control, shaken(&lanes, &mut of_control)), (&imagination, shaken(&lanes, &mut of_imagination))];
             for (learner, batch) in batches {
                 let layout = learner.layout;
                 let automatic = layout.autodiff(&learner.actor, &batch, PpoLoss { clip: 0.2 });

@@ -426,7 +426,8 @@ impl Trainer {
             let epochs = settings.epochs;
             let ppo = PpoSettings { gamma: settings.gamma as f32, epochs, critic_epochs: epochs, ..ppo };
             let rate = rate_of(learner);
-            update(learner, lanes, imagination, &ppo, rate, self.iteration, workspace)
+            let stats = update(learner, lanes, imagination, &ppo, rate, self.iteration, workspace);
+            (stats, rate)
         });
         if ![Some(&self.control), self.imagination.as_ref()].into_iter().flatten().all(Learner::is_finite) {
             bail!(
@@ -466,11 +467,12 @@ impl Trainer {
             ("charts/sigma".into(), self.control.sigma()),
         ];
         scalars.extend(stats.scalars().map(|(name, value)| (format!("losses/{name}"), value)));
-        if let (Some(learner), Some(stats)) = (&self.imagination, imagination_stats) {
+        if let (Some(learner), Some((stats, rate))) = (&self.imagination, imagination_stats) {
             let rewards: f64 = imagination.iter().flat_map(|track| &track.rewards).map(|r| f64::from(*r)).sum();
             let errors: f64 = lanes.iter().flat_map(|lane| &lane.follow_errors).map(|e| f64::from(*e)).sum();
             scalars.push(("imagination/reward".into(), rewards / steps));
             scalars.push(("imagination/follow_error".into(), errors / steps));
+            scalars.push(("imagination/learning_rate".into(), f64::from(rate)));
             scalars.push(("imagination/sigma".into(), learner.sigma()));
             scalars.extend(stats.scalars().map(|(name, value)| (format!("imagination/{name}"), value)));
         }
@@ -710,7 +712,9 @@ mod tests {
     #[test]
     fn six_iterations_are_three_and_a_resumption_and_three() {
         for method in Method::ALL {
-            let config = TrainConfig { total_steps: 6 * 96, ..small(method) };
+            // With a learning rate that falls and with one that is adapted.
+            let kl_target = if method.imagination() { 0.01 } else { 0.0 };
+            let config = TrainConfig { total_steps: 6 * 96, kl_target, ..small(method) };
             let mut straight = Trainer::new(&config, &teams, "trivial").unwrap();
             let reports: Vec<_> = (0..6).map(|_| straight.iterate().unwrap().scalars).collect();
 
@@ -800,6 +804,10 @@ mod tests {
             ("total_steps = 0", "total_steps is 0"),
             ("learning_rate = nan", "learning_rate is NaN"),
             ("entropy = -0.1", "entropy is -0.1; it must be 0 or more"),
+            ("kl_target = -0.01", "kl_target is -0.01; it must be 0 or more"),
+            ("kl_target = 0.01\nlearning_rate = 0.1", "learning_rate is 0.1; with a kl_target it must be from 0.00001"),
+            ("sigma_min = 0.5", "sigma_min is 0.5; it must not be above sigma, 0.45"),
+            ("sigma = 0.8\nsigma_min = 0.5", "sigma_min is 0.5; it must not be above imagination.sigma, 0.45"),
         ] {
             let config: TrainConfig = toml::from_str(text).unwrap();
             let error = config.validate().unwrap_err().to_string();
@@ -815,6 +823,18 @@ mod tests {
         let config = small(Method::Mappo);
         let checkpoint = Trainer::new(&config, &teams, "trivial").unwrap().checkpoint().unwrap();
         assert_eq!(config_of(&checkpoint).unwrap(), config);
+    }
+
+    #[test]
+    fn an_adapted_learning_rate_grows_while_the_policy_hardly_moves() {
+        let config = TrainConfig { kl_target: 1.0, kl_stop: 10.0, ..small(Method::Composer) };
+        let mut trainer = Trainer::new(&config, &teams, "trivial").unwrap();
+        let rates = [0, 1, 2].map(|_| trainer.iterate().unwrap());
+        for (report, expected) in rates.iter().zip([5e-4, 7.5e-4, 1.125e-3]) {
+            for name in ["charts/learning_rate", "imagination/learning_rate"] {
+                assert!((report.get(name) - expected).abs() < 1e-8, "{name}: {}", report.get(name));
+            }
+        }
     }
 
     #[test]
