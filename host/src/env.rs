@@ -88,6 +88,8 @@ pub struct EnvConfig {
     pub delay: [usize; 2],
     /// Faults drawn in training.
     pub faults: FaultTraining,
+    /// What the modules take the time constant for with which joints without torque straighten, s; none: the robot's own.
+    pub relax_seconds: Option<f32>,
 }
 
 impl EnvConfig {
@@ -100,7 +102,21 @@ impl EnvConfig {
             control_period: 0.05,
             delay: [1, 1],
             faults: FaultTraining::default(),
+            relax_seconds: None,
         }
+    }
+
+    /// The same with the physics step divided by `times`. Control period, delay in seconds, sensors and slew stay as they are, and so do the
+    /// episodes: what comes out differently is the error of the coarser step.
+    pub fn finer(mut self, times: usize) -> Self {
+        self.robot.physics_step /= times as f32;
+        self.delay = self.delay.map(|steps| steps * times);
+        self
+    }
+
+    /// Control steps before an episode is cut.
+    pub fn cap(&self) -> u32 {
+        self.task.settings.cap_for(self.robot.modules)
     }
 
     /// Physics steps in one control step.
@@ -174,7 +190,10 @@ impl SnakeEnv {
         let modules = config.robot.modules;
         let mut env = SnakeEnv {
             limits: config.robot.limits(),
-            relax: relax_factor((config.control_period * 1e6).round() as u32, config.robot.relax_seconds()),
+            relax: relax_factor(
+                (config.control_period * 1e6).round() as u32,
+                config.relax_seconds.unwrap_or_else(|| config.robot.relax_seconds()),
+            ),
             judge,
             faults: Vec::new(),
             now: FaultsNow::default(),
@@ -351,7 +370,7 @@ impl Environment for SnakeEnv {
         Outcome {
             reward,
             terminated: success,
-            truncated: !success && steps >= self.config.task.settings.cap,
+            truncated: !success && steps >= self.config.cap(),
             success,
             distance,
             steps,
@@ -505,6 +524,26 @@ mod tests {
             if task.task() == Task::GoalReaching {
                 assert!((left(&here) - left(&there) - 0.5).abs() < 1e-3);
             }
+        }
+    }
+
+    #[test]
+    fn a_finer_step_changes_neither_the_episode_nor_when_a_torque_acts() {
+        let config = EnvConfig { delay: [1, 3], ..EnvConfig::new(Task::BlockPushing, Robot::default()) };
+        let fine = config.clone().finer(4);
+        assert_eq!((config.substeps(), fine.substeps(), fine.delay), (5, 20, [4, 12]));
+        assert_eq!(config.clone().finer(1), config);
+        let (mut coarse, mut fine) = (SnakeEnv::new(Arc::new(config)), SnakeEnv::new(Arc::new(fine)));
+        coarse.reset_with(5, &[]);
+        fine.reset_with(5, &[]);
+        assert_eq!(coarse.judge().course(), fine.judge().course());
+        drive(&mut coarse, 3);
+        drive(&mut fine, 3);
+        for module in 0..8 {
+            assert_eq!(coarse.command[module], fine.command[module], "slew is per control period");
+            assert!(
+                crate::tasks::distance(coarse.snake.module_position(module), fine.snake.module_position(module)) < 0.2
+            );
         }
     }
 
