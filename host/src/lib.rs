@@ -16,5 +16,6 @@ pub mod robot;
 pub mod run;
 pub mod sil;
 pub mod sim;
+pub mod stats;
 pub mod tasks;
 pub mod train;

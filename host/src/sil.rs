@@ -26,7 +26,7 @@ pub struct SnakePlant {
 impl SnakePlant {
     /// The start of the episode with this seed, the same as [`crate::env::SnakeEnv`]'s.
     pub fn new(config: Arc<EnvConfig>, seed: u64) -> Self {
-        let (snake, judge) = Judge::start(&config.task, seed, &config.robot);
+        let (snake, judge) = config.start(seed);
         let torques = vec![[0; AXES]; config.robot.modules];
         SnakePlant { config, snake, judge, physics_steps: 0, torques, trace: None }
     }

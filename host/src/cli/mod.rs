@@ -6,6 +6,7 @@ mod demo;
 mod eval;
 mod export;
 mod flash;
+mod physics;
 mod policy_file;
 mod report;
 mod sil;
