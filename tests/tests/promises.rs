@@ -177,21 +177,11 @@ fn a_comparison_is_made_from_nothing_and_what_is_done_is_not_done_again() {
 fn the_policies_that_ship_are_made_from_nothing_and_the_median_of_the_seeds_ships() {
     let folder = tempfile::tempdir().unwrap();
     let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../host/configs");
+    let configs = configs.to_str().unwrap();
     let report = |more: &[&str]| {
-        let arguments = [
+        let arguments: [&[&str]; 4] = [
             &["report", "policies", "--tasks", "goal-reaching,shape-formation", "--seeds", "3", "--episodes", "2"],
-            &[
-                "--configs",
-                configs.to_str().unwrap(),
-                "--runs",
-                "r",
-                "--out",
-                "o",
-                "--ship",
-                "s",
-                "--set",
-                "total_steps=512",
-            ],
+            &["--configs", configs, "--runs", "r", "--out", "o", "--ship", "s", "--set", "total_steps=512"],
             &["--set", "environments=4", "--set", "rollout_steps=32", "--set", "evaluation_episodes=1"],
             more,
         ];

@@ -158,6 +158,7 @@ pub fn table(report: &Report) -> String {
     let bearings: Vec<_> = report
         .by_bearing
         .iter()
+        .filter(|b| b.episodes > 0)
         .map(|b| {
             let success = with_interval(b.success_rate, b.success_low, b.success_high, 2);
             format!("{:?} {success} of {}", b.bearing, b.episodes).to_lowercase()
