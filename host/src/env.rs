@@ -542,7 +542,7 @@ mod tests {
     fn a_finer_step_changes_neither_the_episode_nor_when_a_torque_acts() {
         let config = EnvConfig { delay: [1, 3], ..EnvConfig::new(Task::BlockPushing, Robot::default()) };
         let fine = config.clone().finer(4);
-        assert_eq!((config.substeps(), fine.substeps(), fine.delay), (5, 20, [4, 12]));
+        assert_eq!((config.substeps(), fine.substeps(), fine.delay), (10, 40, [4, 12]));
         assert_eq!(config.clone().finer(1), config);
         let (mut coarse, mut fine) = (SnakeEnv::new(Arc::new(config)), SnakeEnv::new(Arc::new(fine)));
         coarse.reset_with(5, &[]);

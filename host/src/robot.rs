@@ -62,10 +62,16 @@ pub struct Robot {
     pub physics_step: f32,
     /// What solves for the velocities: `direct` ([`crate::sim::chain`]) or `rapier`, its own joints and solver as a second opinion.
     pub solver: Solver,
-    /// The direct solver stops when twice the energy that a further sweep could gain is below this, kg units^2 / s^2. Smaller: more sweeps.
+    /// The direct solver stops when twice the energy that a further sweep could gain, per second of simulated time, is below this,
+    /// kg units^2 / s^3. Smaller: more sweeps.
     pub solver_tolerance: f32,
     /// Most sweeps of the direct solver in a step; it needs about 5.
     pub solver_iterations: usize,
+    /// Sub-steps and iterations of rapier's solver in a step. Fewer: faster, and a chain that is not converged: what is learnt with one
+    /// sub-step and 4 iterations is lost with 16.
+    pub rapier_substeps: usize,
+    /// See `rapier_substeps`.
+    pub rapier_iterations: usize,
     /// What the numbers above mean in SI.
     pub scale: Scale,
 }
@@ -224,6 +230,11 @@ impl Robot {
         }
         if !(4..=1000).contains(&self.solver_iterations) {
             return invalid(format!("solver_iterations = {}; 4 to 1000 are possible", self.solver_iterations));
+        }
+        for (name, value) in [("rapier_substeps", self.rapier_substeps), ("rapier_iterations", self.rapier_iterations)] {
+            if !(1..=1000).contains(&value) {
+                return invalid(format!("{name} = {value}; 1 to 1000 are possible"));
+            }
         }
         if self.link_radius > 2.0 * self.link_length {
             return invalid(format!(

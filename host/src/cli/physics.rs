@@ -138,7 +138,7 @@ mod tests {
         let both = Physics { finer: 2, vary: vec!["gravity=100".into()], ..Physics::default() };
         assert_eq!(both.to_string(), "finer=2, gravity=100");
         let config = apply(both).unwrap();
-        assert_eq!((config.robot.gravity, config.delay, config.substeps()), (100.0, [2, 2], 10));
+        assert_eq!((config.robot.gravity, config.delay, config.substeps()), (100.0, [2, 2], 20));
     }
 
     #[test]
@@ -153,7 +153,7 @@ mod tests {
         for (assignment, words) in [
             ("gravity", "write KEY=VALUE"),
             ("gravity=down", "gravity=down: the value must be a number such as 196.2"),
-            ("solver_iterations=1.5", "must be a number such as 4"),
+            ("solver_iterations=1.5", "must be a number such as 60"),
             ("link_mass=-1", "link_mass = -1"),
         ] {
             let message = varied(&[assignment]).unwrap_err();

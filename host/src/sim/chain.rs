@@ -41,7 +41,7 @@
 //!
 //! The iteration starts from the last velocities; the first sweeps take friction's Hessian without its curvature (an upper bound: full curvature
 //! from the start diverges). If the slope at the end of a step exceeds half of that at its start, it went too far, and a short line search goes back.
-//! It ends when `-gradient . step`, twice the energy still to be gained, is below `solver_tolerance`.
+//! It ends when `-gradient . step`, twice the energy still to be gained, is below `solver_tolerance` times `dt`.
 //!
 //! No fused multiply-add and no library trigonometry but `libm`'s, so that every processor computes the same bits.
 
@@ -884,12 +884,13 @@ impl Chain {
     /// Velocities at the end of the step.
     fn solve(&mut self, robot: &Robot, law: &Law) {
         self.evaluate(robot, law, 0.0);
+        let tolerance = robot.solver_tolerance * law.dt;
         let mut sweeps = 0;
         loop {
             let gain = self.sweep(robot, law.dt);
             self.advance(1.0);
             sweeps += 1;
-            if gain < robot.solver_tolerance {
+            if gain < tolerance {
                 break;
             }
             if sweeps >= robot.solver_iterations {

@@ -23,6 +23,7 @@ use crate::robot::{Robot, Solver};
 pub mod chain;
 pub mod collide;
 pub mod contact;
+pub mod open_loop;
 mod rapier;
 pub mod scene;
 
@@ -440,7 +441,7 @@ mod tests {
     /// Ten seconds of a travelling wave; `phase` is the lag from module to module. Returns the head's displacement along x.
     fn wave(robot: &Robot, phase: f32) -> (f32, Snake) {
         let mut snake = Snake::new(robot);
-        for step in 0..1000 {
+        for step in 0..snake.steps_in(10.0) {
             let time = step as f32 * robot.physics_step;
             for module in 0..robot.modules {
                 let yaw = 0.8 * robot.torque_limit * libm::sinf(std::f32::consts::TAU * time + phase * module as f32);
@@ -476,7 +477,7 @@ mod tests {
     #[test]
     fn a_snake_at_rest_stays_at_rest() {
         let mut snake = Snake::new(&Robot::default());
-        (0..500).for_each(|_| snake.step());
+        (0..snake.steps_in(5.0)).for_each(|_| snake.step());
         let [x, y, z] = snake.head();
         assert!(x.abs() < 0.01 && y.abs() < 0.01 && (z - 0.4).abs() < 0.02, "{x} {y} {z}");
     }
@@ -487,13 +488,13 @@ mod tests {
         for module in 0..8 {
             snake.set_torque(module, [80.0, if module % 2 == 0 { 60.0 } else { -60.0 }]);
         }
-        (0..60).for_each(|_| snake.step());
+        (0..snake.steps_in(0.6)).for_each(|_| snake.step());
         (0..8).for_each(|module| snake.set_torque(module, [0.0; 2]));
-        (0..30).for_each(|_| snake.step());
+        (0..snake.steps_in(0.3)).for_each(|_| snake.step());
         let mut energy = snake.energy();
         let start = energy;
         for _ in 0..40 {
-            (0..5).for_each(|_| snake.step());
+            (0..snake.steps_in(0.05)).for_each(|_| snake.step());
             let now = snake.energy();
             assert!(now <= energy + 0.02 * start, "{energy} -> {now}");
             energy = now;
@@ -508,7 +509,7 @@ mod tests {
         for module in 0..8 {
             snake.set_torque(module, [25.0, -8.0 + 2.0 * module as f32]);
         }
-        (0..150).for_each(|_| snake.step());
+        (0..snake.steps_in(1.5)).for_each(|_| snake.step());
         let mut chain = composer_shared::kinematics::Chain::new(robot.geometry());
         for module in 0..robot.modules {
             chain.hear(module, &snake.sensors(module).joint_angles);

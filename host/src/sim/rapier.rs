@@ -7,7 +7,7 @@
 //!   link along and across with at most `mu` times the load of the last step. That is Coulomb's law with a rectangle (a pyramid) in place
 //!   of the ellipse, without any regularisation.
 //! - Contacts are rapier's springs, 240 Hz (480 Hz against what does not move), critically damped.
-//! - Joints may open a little; 16 iterations keep the chain together. Fewer do not converge: what is learnt with 4 is lost with 16.
+//! - Joints may open a little; 4 sub-steps of 16 iterations keep the chain together (`rapier_substeps`, `rapier_iterations`).
 //! - Links do not rub on each other.
 
 use rapier3d::dynamics::{JointAxesMask, JointEnabled};
@@ -19,8 +19,6 @@ use crate::robot::Robot;
 
 /// Natural frequency of contacts, Hz, and its share against bodies that do not move.
 const CONTACT_FREQUENCY: f32 = 240.0;
-/// Iterations of the solver with which the chain is converged.
-pub const ITERATIONS: usize = 16;
 /// Contacts of a link with what does not move that have friction.
 const SLOTS: usize = 2;
 /// How hard friction holds what it can hold, force per unit/s.
@@ -68,8 +66,8 @@ impl RapierSnake {
     pub fn new(robot: &Robot, scene: &Scene) -> Self {
         let mut world = PhysicsWorld { gravity: Vector::new(0.0, 0.0, -robot.gravity), ..PhysicsWorld::default() };
         let parameters = &mut world.integration_parameters;
-        parameters.dt = robot.physics_step;
-        parameters.num_solver_iterations = ITERATIONS;
+        parameters.dt = robot.physics_step / robot.rapier_substeps as f32;
+        parameters.num_solver_iterations = robot.rapier_iterations;
         parameters.num_internal_stabilization_iterations = 0;
         parameters.max_ccd_substeps = 0;
         parameters.contact_softness = SpringCoefficients::new(CONTACT_FREQUENCY, 1.0);
@@ -178,13 +176,15 @@ impl RapierSnake {
                 motor.damping = robot.damping_at(*speed);
             }
         }
-        self.rub(robot);
-        self.world.step();
+        for _ in 0..robot.rapier_substeps {
+            self.rub(robot);
+            self.world.step();
+        }
     }
 
     /// Sets the friction of each link to the loads of the last step.
     fn rub(&mut self, robot: &Robot) {
-        self.find_loads(robot.physics_step);
+        self.find_loads(self.world.integration_parameters.dt);
         for handle in self.still.iter().flatten().chain(&self.on_block) {
             if let Some(joint) = self.world.impulse_joints.get_mut(*handle, false) {
                 joint.data.enabled = JointEnabled::Disabled;

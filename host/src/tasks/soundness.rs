@@ -167,7 +167,7 @@ fn episode(task: &TaskConfig, robot: &Robot, seed: u64) -> Worst {
         for module in 0..robot.modules {
             snake.set_torque(module, pilot.torque(step, module).map(|t| t * robot.torque_limit));
         }
-        for _ in 0..5 {
+        for _ in 0..snake.steps_in(0.05) {
             let block_before = snake.block();
             snake.step();
             let now: Vec<Point> = snake.poses().map(|(p, _)| p).collect();
