@@ -4,7 +4,7 @@
 //! |---|---|
 //! | start | straight, at rest, head at the origin, facing +x |
 //! | targets | one a module, a module's length apart along a curve: line, arc, C, S, U, ring or spiral, each as often, bent to either side; its middle up to `place` units from the snake's, turned by up to `heading` |
-//! | | targets lie at least 1.6 times the success distance from the modules, in the mean: the snake must move. Bend, place and heading are drawn anew until they do, the kind is not; of a line that leaves places and headings near their limits. After 1,000 draws (a kind with too little room, such as a line of three modules) the farthest of them counts |
+//! | | targets lie at least 1.6 times the success distance from the modules, in the mean: the snake must move. Bend, place and heading are drawn anew until they do, the kind is not; of a line that leaves places and headings near their limits. Of eight modules or more, every kind finds such targets (a line of eight in one draw of 57); of fewer, some never do, lines first, and the farthest of 1,000 draws counts |
 //! | reward `paper` | `-sum_i d(module_i, target_i)` |
 //! | left to do (`progress`) | `sum_i d(module_i, target_i)` |
 //! | success | mean over the modules of `d(module_i, target_i)` < 1.25 units: the paper's sum is below `n d_g`; ends the episode |
