@@ -91,8 +91,8 @@ impl ActorLayout {
             let mut heard = batch.heard.iter();
             for (mask, present) in mask.chunks_exact_mut(modules * modules).zip(&batch.modules) {
                 for (mask, heard) in mask.chunks_exact_mut(modules).zip(heard.by_ref().take(*present)) {
-                    for (_, mask) in mask.iter_mut().enumerate().filter(|(other, _)| heard >> other & 1 == 0) {
-                        *mask = UNHEARD;
+                    for (other, mask) in mask.iter_mut().enumerate() {
+                        *mask = if heard >> other & 1 == 0 { UNHEARD } else { 0.0 };
                     }
                 }
             }
