@@ -8,6 +8,7 @@ pub mod files;
 pub mod flash;
 pub mod freeze;
 pub mod methods;
+pub mod mjcf;
 pub mod network;
 pub mod plot;
 pub mod recorder;
