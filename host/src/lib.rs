@@ -4,6 +4,7 @@ pub mod cli;
 pub mod env;
 pub mod environment;
 pub mod eval;
+pub mod external;
 pub mod files;
 pub mod flash;
 pub mod freeze;
