@@ -6,7 +6,7 @@
 //! at a time, applies the torque it answers with, and sends the frames it offers. It allocates nothing, never panics, and does a
 //! bounded amount of work per call, whatever the bus delivers.
 //!
-//! [`drivers`] read the sensors and drive the motors over `embedded-hal`; [`node_page`] is what a board knows of itself.
+//! [`attitude`] estimates which way is up; [`drivers`] read the sensors and drive the motors over `embedded-hal`; [`node_page`] is what a board knows of itself.
 //!
 //! [`neighbours`] keeps what was heard from the other modules and how fresh it is; [`failsafe`] decides when the motors relax
 //! and why. [`link`] is how an emulated module talks to the simulator.
@@ -14,6 +14,7 @@
 #[cfg(test)]
 extern crate std;
 
+pub mod attitude;
 pub mod controller;
 pub mod drivers;
 pub mod failsafe;

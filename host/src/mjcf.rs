@@ -133,11 +133,15 @@ fn write_model(out: &mut String, robot: &Robot, scene: &Scene, options: Options)
     }
     writeln!(out, "    {}", "</body>".repeat(robot.links()))?;
     if let Some(block) = &scene.block {
-        let inertia = cuboid_inertia(block.mass, block.half);
         let turn = quaternion([0.0, 0.0, libm::sinf(0.5 * block.yaw), libm::cosf(0.5 * block.yaw)]);
         writeln!(out, "    <body name=\"block\" pos=\"{}\" quat=\"{turn}\">", row(&block.position))?;
         writeln!(out, "      <freejoint name=\"block\"/>")?;
-        writeln!(out, "      <inertial pos=\"0 0 0\" mass=\"{}\" diaginertia=\"{}\"/>", block.mass, row(&inertia))?;
+        writeln!(
+            out,
+            "      <inertial pos=\"0 0 0\" mass=\"{}\" diaginertia=\"{}\"/>",
+            block.mass,
+            row(&block.moments())
+        )?;
         // By its priority the block's own friction counts, whatever the other side's.
         writeln!(
             out,
@@ -180,12 +184,6 @@ fn collision_bits(module: usize) -> (u32, u32) {
     let bit = |m: usize| 1u32 << (m % SHARED_BITS);
     let near = bit(module) | bit(module + 1) | bit(module + SHARED_BITS - 1);
     (bit(module), ALL_BITS & !near)
-}
-
-/// Moments of inertia of a solid cuboid about its own axes, kg units^2.
-fn cuboid_inertia(mass: f32, half: [f32; 3]) -> [f32; 3] {
-    let [x, y, z] = half.map(|h| h * h);
-    [mass / 3.0 * (y + z), mass / 3.0 * (x + z), mass / 3.0 * (x + y)]
 }
 
 fn row(numbers: &[f32]) -> String {
@@ -295,11 +293,5 @@ mod tests {
                 }
             }
         }
-    }
-
-    #[test]
-    fn a_cube_has_the_inertia_of_a_cube() {
-        // m a^2 / 6 with an edge of 2.
-        assert_eq!(cuboid_inertia(6.0, [1.0; 3]), [4.0; 3]);
     }
 }

@@ -6,6 +6,7 @@
 use std::path::Path;
 
 use composer_shared::robot::{Geometry, Limits, MAX_JOINTS, MAX_MODULES};
+use composer_sim_bridge::sensor_model::PERIOD;
 use serde::{Deserialize, Serialize};
 
 /// The paper's robot, and the default of every command.
@@ -47,15 +48,53 @@ pub struct Robot {
     pub friction_along: f32,
     /// Friction coefficient across a link. Only its ratio to `friction_along` lets a wave propel the snake.
     pub friction_across: f32,
+    /// Sliding speed at which a contact's friction has reached 71 % of its Coulomb limit in the direction of less friction, units/s; in the other
+    /// direction it is smaller by the ratio of the coefficients. Higher: contacts that should hold creep, the solver has less to do.
+    pub slip_speed: f32,
+    /// Stiffness of a contact, force per unit of depth. Higher: shallower contacts, more sweeps of the solver.
+    pub contact_stiffness: f32,
+    /// Damping of a contact (Hunt and Crossley), s per unit: the normal force vanishes when the surfaces part at the inverse of it.
+    /// Higher: landings that bounce less; above about 1 they do not bounce at all.
+    pub contact_damping: f32,
     /// Gravity, units/s^2.
     pub gravity: f32,
-    /// Physics step, s.
+    /// Physics step, s. Smaller: slower and nearer to the truth, in first order.
     pub physics_step: f32,
-    /// Iterations of the constraint solver in one step; fewer are faster and let joints drift apart.
+    /// What solves for the velocities: `direct` ([`crate::sim::chain`]) or `rapier`, its own joints and solver as a second opinion.
+    pub solver: Solver,
+    /// The direct solver stops when twice the energy that a further sweep could gain is below this, kg units^2 / s^2. Smaller: more sweeps.
+    pub solver_tolerance: f32,
+    /// Most sweeps of the direct solver in a step; it needs about 5.
     pub solver_iterations: usize,
     /// What the numbers above mean in SI.
     pub scale: Scale,
 }
+
+/// What solves for the velocities of a step.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Solver {
+    /// Articulated-body sweeps inside Newton's method ([`crate::sim::chain`]).
+    #[default]
+    Direct,
+    /// Rapier's joints, contacts and iterations.
+    Rapier,
+}
+
+impl std::str::FromStr for Solver {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Self, String> {
+        match name {
+            "direct" => Ok(Solver::Direct),
+            "rapier" => Ok(Solver::Rapier),
+            _ => Err(format!("there is no solver {name}; there are direct and rapier")),
+        }
+    }
+}
+
+/// Faster than the no-load speed the drive brakes with this many times its normal damping.
+const OVERSPEED_BRAKE: f32 = 8.0;
 
 /// SI values of one robot unit.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -149,6 +188,10 @@ impl Robot {
             ("joint_angle_limit", self.joint_angle_limit),
             ("friction_along", self.friction_along),
             ("friction_across", self.friction_across),
+            ("slip_speed", self.slip_speed),
+            ("contact_stiffness", self.contact_stiffness),
+            ("contact_damping", self.contact_damping),
+            ("solver_tolerance", self.solver_tolerance),
             ("gravity", self.gravity),
             ("physics_step", self.physics_step),
             ("scale.metres_per_unit", self.scale.metres_per_unit),
@@ -162,11 +205,15 @@ impl Robot {
         if !(self.damping >= 0.0 && self.damping.is_finite()) {
             return invalid(format!("damping = {}; it must be zero or more", self.damping));
         }
-        if self.physics_step > 0.02 {
-            return invalid(format!("physics_step = {}; above 0.02 s the joints come apart", self.physics_step));
+        let in_a_sample = PERIOD / self.physics_step;
+        if in_a_sample < 0.999 || (in_a_sample - in_a_sample.round()).abs() > 1e-3 * in_a_sample {
+            return invalid(format!(
+                "physics_step = {}; it must be {PERIOD} s, at which the sensors sample, or a whole part of it",
+                self.physics_step
+            ));
         }
-        if !(1..=64).contains(&self.solver_iterations) {
-            return invalid(format!("solver_iterations = {}; 1 to 64 are possible", self.solver_iterations));
+        if !(4..=1000).contains(&self.solver_iterations) {
+            return invalid(format!("solver_iterations = {}; 4 to 1000 are possible", self.solver_iterations));
         }
         if self.link_radius > 2.0 * self.link_length {
             return invalid(format!(
@@ -201,6 +248,12 @@ impl Robot {
     /// Damping of a joint: its own and that of the motor's torque-speed line, torque per rad/s.
     pub fn joint_damping(&self) -> f32 {
         self.damping + self.torque_limit / self.joint_speed_limit
+    }
+
+    /// The same at a joint speed (rad/s): beyond the no-load speed the drive brakes harder.
+    pub fn damping_at(&self, speed: f32) -> f32 {
+        let over = (speed.abs() / self.joint_speed_limit - 1.0).clamp(0.0, 1.0);
+        self.joint_damping() * (1.0 + OVERSPEED_BRAKE * over)
     }
 
     /// Time constant with which a joint without torque relaxes towards straight, s.

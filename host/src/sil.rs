@@ -37,14 +37,10 @@ impl SnakePlant {
     }
 
     /// The same episode, of a plant elsewhere.
-    pub fn elsewhere(config: Arc<EnvConfig>, seed: u64, elsewhere: &Elsewhere) -> Result<Self, PlantTrouble> {
-        let mut plant = SnakePlant::new(config, seed);
-        let scene = &plant.judge.course().scene;
-        let external = External::start(elsewhere, &plant.config.robot, scene, seed)?;
-        plant.snake = mirror::new(&plant.config.robot, scene)?;
-        mirror::show(&mut plant.snake, &external);
-        plant.external = Some(external);
-        Ok(plant)
+    pub fn elsewhere(config: Arc<EnvConfig>, seed: u64, elsewhere: &Elsewhere) -> Result<Self, PlantError> {
+        let plant = SnakePlant::new(config, seed);
+        let (external, snake) = External::start(elsewhere, &plant.config.robot, &plant.judge.course().scene, seed)?;
+        Ok(SnakePlant { snake, external: Some(external), ..plant })
     }
 
     /// Why the plant elsewhere did not go on to the end, if so: then nothing about the episode means anything.
@@ -94,7 +90,7 @@ impl Plant for SnakePlant {
 
     fn sensors(&self, module: usize) -> Sensors {
         match &self.external {
-            Some(external) => external.sensors(module),
+            Some(external) => external.sensors(&self.snake, module),
             None => self.snake.sensors(module),
         }
     }
@@ -105,10 +101,7 @@ impl Plant for SnakePlant {
 
     fn set_torque(&mut self, module: usize, torque: [f32; AXES]) {
         self.torques[module] = torque.map(f32::to_bits);
-        match &mut self.external {
-            Some(external) => external.set_torque(module, torque),
-            None => self.snake.set_torque(module, torque),
-        }
+        self.snake.set_torque(module, torque);
     }
 
     fn step(&mut self) {
@@ -116,10 +109,7 @@ impl Plant for SnakePlant {
             trace.extend_from_slice(&self.torques);
         }
         match &mut self.external {
-            Some(external) => {
-                external.step();
-                mirror::show(&mut self.snake, external);
-            }
+            Some(external) => external.step(&mut self.snake),
             None => self.snake.step(),
         }
         self.judge.watch(&self.config.task, &self.snake);
@@ -133,31 +123,4 @@ impl Plant for SnakePlant {
         let over = self.judge.verdict().success || self.judge.steps() >= self.config.task.settings.cap;
         over || self.trouble().is_some()
     }
-}
-
-/// Why an episode of a plant elsewhere cannot begin.
-#[derive(Debug, thiserror::Error)]
-pub enum PlantTrouble {
-    /// The plant's fault.
-    #[error(transparent)]
-    Plant(#[from] PlantError),
-    /// The own.
-    #[error("the snake of this program cannot mirror a plant elsewhere yet")]
-    NoMirror,
-}
-
-// MERGE: the one place where the snake becomes a mirror. With `Snake::mirror(robot, scene)` and a setter, `new` returns the former and `show` hands
-// over `external.mirror()` (poses and velocities of the links, joint angles and speeds, the block) and `external.torques()` (what
-// `Snake::torque` returns to the recorder); `Snake::motion` has to follow from it. Then `NoMirror` goes, and so does the `ignore` in
-// `tests/tests/mujoco.rs`.
-mod mirror {
-    use super::{External, PlantTrouble, Snake};
-    use crate::robot::Robot;
-    use crate::sim::Scene;
-
-    pub fn new(_robot: &Robot, _scene: &Scene) -> Result<Snake, PlantTrouble> {
-        Err(PlantTrouble::NoMirror)
-    }
-
-    pub fn show(_snake: &mut Snake, _external: &External) {}
 }

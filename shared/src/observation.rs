@@ -10,7 +10,7 @@
 //! | 3..6 | direction to the goal | - | own | unit vector |
 //! | 6 | ln(1 + distance of the [`Seeker`] to the goal) | ln(robot units) | - | 1 |
 //! | 7 | the goal is known | - | - | 0 or 1; if 0, fields 0..7 are 0 |
-//! | 8..11 | up (against gravity) | - | own | unit vector |
+//! | 8..11 | up (against gravity), by the attitude filter | - | own | unit vector |
 //! | 11..14 | angular rate | rad/s | own | / 5 |
 //! | 14..18 | joint angles, head end first | rad | joint | 1 |
 //! | 18..22 | joint speeds | rad/s | joint | / 5 |
@@ -119,7 +119,8 @@ pub struct Sensors {
     pub joint_angles: [f32; MAX_JOINTS],
     /// Joint speeds, rad/s.
     pub joint_speeds: [f32; MAX_JOINTS],
-    /// Direction against gravity in the own frame (accelerometer), about a unit vector.
+    /// Direction against gravity in the own frame: a unit vector from the firmware's attitude filter (gyroscope and accelerometer). Zeros if
+    /// it is not known, and of another length if what the accelerometer feels in the mean is not 1 g.
     pub up: [f32; 3],
     /// Angular rate in the own frame (gyroscope), rad/s.
     pub angular_rate: [f32; 3],

@@ -93,8 +93,9 @@ class Plant:
     """One snake in its scene. `parameters` are fields of the robot by their names in a robot file; those missing come from the model."""
 
     def __init__(self, xml, parameters, modules=None, internal_step=INTERNAL_STEP, iterations=ITERATIONS, integrator="implicit",
-                 own_contacts=False):
+                 own_contacts=False, imu=False):
         self.own_contacts = own_contacts
+        self.imu = imu
         self.explicit = integrator == "explicit"
         self.internal_step = internal_step
         self.iterations = iterations
@@ -356,21 +357,25 @@ class Plant:
         position = d.xpos[self.bodies]
         linear = (twist[3:] + cross(twist[:3], position.T)).T
         quaternion = d.xquat[self.bodies][:, [1, 2, 3, 0]]
-        rotation = d.xmat[self.bodies].reshape(links, 3, 3)[self.own]
-        rate = np.einsum("mji,mj->mi", rotation, angular[self.own])
         block = None
         if self.block >= 0:
-            block = {"position": d.xpos[self.block].tolist(), "rotation": d.xquat[self.block][[1, 2, 3, 0]].tolist()}
+            turn = d.xmat[self.block].reshape(3, 3)
+            block = {"position": d.xpos[self.block].tolist(), "rotation": d.xquat[self.block][[1, 2, 3, 0]].tolist(),
+                     "linear": qvel[-6:-3].tolist(), "angular": (turn @ qvel[-3:]).tolist()}
         fields = zip(position.tolist(), quaternion.tolist(), linear.tolist(), angular.tolist())
-        return {
+        state = {
             "type": "state",
             "time": d.time,
             "links": [{"position": p, "rotation": q, "linear": v, "angular": w} for p, q, v, w in fields],
             "joint_angles": d.qpos[7:6 + links].tolist(),
             "joint_speeds": qvel[self.hinge].tolist(),
             "block": block,
-            "imu": [{"up": u, "rate": w} for u, w in zip(rotation[:, 2].tolist(), rate.tolist())],
         }
+        if self.imu:
+            rotation = d.xmat[self.bodies].reshape(links, 3, 3)[self.own]
+            rate = np.einsum("mji,mj->mi", rotation, angular[self.own])
+            state["imu"] = [{"up": u, "rate": w} for u, w in zip(rotation[:, 2].tolist(), rate.tolist())]
+        return state
 
 
 def cross_rows(a, b):
@@ -409,7 +414,7 @@ class Session:
                 raise Refused("a reset needs the model as `mjcf`")
             o = self.options
             plant = Plant(message["mjcf"], message.get("robot", {}), self.numbers and self.numbers[0],
-                          internal_step=o.internal_step, iterations=o.iterations, integrator=o.integrator, own_contacts=o.own_contacts)
+                          internal_step=o.internal_step, iterations=o.iterations, integrator=o.integrator, own_contacts=o.own_contacts, imu=o.imu)
             if self.numbers and plant.links != self.numbers[1]:
                 raise Refused(f"the model has {plant.links} links and the greeting said {self.numbers[1]}")
             self.plant = plant
@@ -518,6 +523,7 @@ def main():
     parser.add_argument("--iterations", type=int, default=ITERATIONS, help="iterations of the implicit step [%(default)s]")
     parser.add_argument("--integrator", choices=["implicit", "explicit"], default="implicit", help="explicit: MuJoCo's own step; at most 1/20000 s")
     parser.add_argument("--own-contacts", action="store_true", help="MuJoCo's own contacts instead of the simulator's law")
+    parser.add_argument("--imu", action="store_true", help="sense for the modules instead of leaving that to the host's model of the sensors")
     parser.add_argument("--gait", action="store_true", help="run the open-loop gait and print where the head is")
     parser.add_argument("--model", metavar="FILE", help="model for --gait, from `snakectl mjcf`")
     parser.add_argument("--seconds", type=float, default=10.0, help="length of the gait [%(default)s]")

@@ -32,7 +32,7 @@ const FAREWELL: Duration = Duration::from_millis(500);
 /// A longer line is nonsense. The state of 64 modules takes a tenth of a megabyte.
 const LONGEST_LINE: usize = 16 << 20;
 
-/// A link of the snake. World frame, units, s.
+/// A link of the snake, or the block. World frame, units, s.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct LinkState {
     /// Its centre.
@@ -46,7 +46,7 @@ pub struct LinkState {
 }
 
 /// All that the host has to know of a plant elsewhere to judge, record and show it.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, Deserialize)]
 pub struct MirrorState {
     /// The links, head first.
     pub links: Vec<LinkState>,
@@ -54,8 +54,8 @@ pub struct MirrorState {
     pub joint_angles: Vec<f32>,
     /// Speed of every joint, rad/s.
     pub joint_speeds: Vec<f32>,
-    /// Position and rotation (quaternion x, y, z, w) of the block, if there is one.
-    pub block: Option<([f32; 3], [f32; 4])>,
+    /// The block, if there is one.
+    pub block: Option<LinkState>,
 }
 
 /// What a module's IMU reads, in the frame of its own link.
@@ -72,8 +72,8 @@ pub struct Imu {
 pub struct State {
     /// Links, joints, block.
     pub mirror: MirrorState,
-    /// The modules' IMUs, head first.
-    pub imu: Vec<Imu>,
+    /// The modules' IMUs, head first, if the plant has its own; otherwise they are worked out from the links.
+    pub imu: Option<Vec<Imu>>,
 }
 
 /// How many modules and links a snake has.
@@ -265,18 +265,10 @@ enum Answer {
 
 #[derive(Deserialize)]
 struct WireState {
-    links: Vec<LinkState>,
-    joint_angles: Vec<f32>,
-    joint_speeds: Vec<f32>,
+    #[serde(flatten)]
+    mirror: MirrorState,
     #[serde(default)]
-    block: Option<WirePose>,
-    imu: Vec<Imu>,
-}
-
-#[derive(Deserialize)]
-struct WirePose {
-    position: [f32; 3],
-    rotation: [f32; 4],
+    imu: Option<Vec<Imu>>,
 }
 
 /// The near end of the connection.
@@ -450,13 +442,13 @@ impl ExternalPlant {
         }
     }
 
-    fn checked(&self, wire: WireState) -> Result<State, PlantError> {
+    fn checked(&self, WireState { mirror, imu }: WireState) -> Result<State, PlantError> {
         let Size { modules, links } = self.size;
         for (what, got, want) in [
-            ("links", wire.links.len(), links),
-            ("joint_angles", wire.joint_angles.len(), links - 1),
-            ("joint_speeds", wire.joint_speeds.len(), links - 1),
-            ("imu", wire.imu.len(), modules),
+            ("links", mirror.links.len(), links),
+            ("joint_angles", mirror.joint_angles.len(), links - 1),
+            ("joint_speeds", mirror.joint_speeds.len(), links - 1),
+            ("imu", imu.as_ref().map_or(modules, Vec::len), modules),
         ] {
             if got != want {
                 return Err(PlantError::Nonsense(format!("{got} {what} instead of {want}")));
@@ -466,36 +458,27 @@ impl ExternalPlant {
             true => Ok(()),
             false => Err(PlantError::NotFinite(format!("{what} {index}"))),
         };
-        let turned = |what: &str, index: usize, r: &[f32; 4]| {
-            let square: f32 = r.iter().map(|c| c * c).sum();
+        let body = |what: &str, index: usize, b: &LinkState| {
+            finite(what, index, &[&b.position[..], &b.rotation, &b.linear, &b.angular].concat())?;
+            let square: f32 = b.rotation.iter().map(|c| c * c).sum();
             match (square - 1.0).abs() < 0.01 {
                 true => Ok(()),
                 false => Err(PlantError::Nonsense(format!("the rotation of {what} {index} is no unit quaternion"))),
             }
         };
-        for (index, link) in wire.links.iter().enumerate() {
-            finite("link", index, &[link.position, link.linear, link.angular].concat())?;
-            finite("link", index, &link.rotation)?;
-            turned("link", index, &link.rotation)?;
+        for (index, link) in mirror.links.iter().enumerate() {
+            body("link", index, link)?;
         }
-        for (index, pair) in wire.joint_angles.iter().zip(&wire.joint_speeds).enumerate() {
-            finite("joint", index, &[*pair.0, *pair.1])?;
+        if let Some(block) = &mirror.block {
+            body("block", 0, block)?;
         }
-        for (index, imu) in wire.imu.iter().enumerate() {
+        for (index, (angle, speed)) in mirror.joint_angles.iter().zip(&mirror.joint_speeds).enumerate() {
+            finite("joint", index, &[*angle, *speed])?;
+        }
+        for (index, imu) in imu.iter().flatten().enumerate() {
             finite("imu", index, &[imu.up, imu.rate].concat())?;
         }
-        if let Some(block) = &wire.block {
-            finite("block", 0, &block.position)?;
-            finite("block", 0, &block.rotation)?;
-            turned("block", 0, &block.rotation)?;
-        }
-        let mirror = MirrorState {
-            links: wire.links,
-            joint_angles: wire.joint_angles,
-            joint_speeds: wire.joint_speeds,
-            block: wire.block.map(|block| (block.position, block.rotation)),
-        };
-        Ok(State { mirror, imu: wire.imu })
+        Ok(State { mirror, imu })
     }
 
     fn ask<R: Serialize>(&mut self, question: &Question<'_, R>) -> Result<Answer, PlantError> {
@@ -678,7 +661,7 @@ mod tests {
         let state = drive(&stub(&[HELLO, &first, &second], "read -r q"), PATIENCE).unwrap();
         assert_eq!(state.mirror.joint_angles, [-0.15]);
         assert_eq!(state.mirror.links[1].position, [0.0, 0.0, 0.4]);
-        assert_eq!((state.mirror.block, state.imu[0].up), (None, [0.0, 0.0, 1.0]));
+        assert_eq!((state.mirror.block, state.imu.unwrap()[0].up), (None, [0.0, 0.0, 1.0]));
     }
 
     #[test]
@@ -715,13 +698,7 @@ mod tests {
         }
         contains(stub(&[HELLO, &state("0,0")], "sleep 9"), &["nonsense", "2 joint_angles instead of 1"]);
         contains(stub(&[HELLO, &good.replace("[0,0,0,1]", "[0,0,0,2]")], "sleep 9"), &["nonsense", "quaternion"]);
-        contains(
-            stub(
-                &[HELLO, &good.replace("null", &LINK.replace(",\"linear\":[0,0,0],\"angular\":[0,0,0]", ""))],
-                "sleep 9",
-            ),
-            &["block"],
-        );
+        contains(stub(&[HELLO, &good.replace("null", LINK)], "sleep 9"), &["block"]);
         contains(
             stub(&[HELLO, r#"{"type":"error","message":"no such\nmodel"}"#], "sleep 9"),
             &["refuses", "no such model"],

@@ -136,23 +136,49 @@ fn the_gait_is_the_same_by_the_protocol_converged_and_not_that_of_its_own_contac
     assert!((own / GAIT - 0.70).abs() < 0.05, "{own}");
 
     // The same by the protocol.
-    let robot = Robot { torque_slew: 400.0, ..Robot::default() };
-    let command = format!("'{}' '{}' --internal-step 1/250", interpreter(), plant());
+    let robot = Robot { torque_slew: 400.0, physics_step: 0.01, ..Robot::default() };
+    let command = format!("'{}' '{}' --internal-step 1/250 --imu", interpreter(), plant());
     let elsewhere = Elsewhere { address: command.parse().unwrap(), patience: Duration::from_secs(60) };
-    let mut external = External::start(&elsewhere, &robot, &Scene::default(), 1).unwrap();
+    let (mut external, mut snake) = External::start(&elsewhere, &robot, &Scene::default(), 1).unwrap();
     for step in 0..200 {
-        for module in 0..8 {
-            let phase = std::f64::consts::TAU * f64::from(step) * 0.01 + 2.0 * module as f64;
-            external.set_torque(module, [(64.0 * phase.sin()) as f32, 0.0]);
-        }
-        external.step();
+        wave(&mut snake, f64::from(step) * 0.01);
+        external.step(&mut snake);
         assert!(external.trouble().is_none(), "{:?}", external.trouble());
     }
-    let head = f64::from(external.mirror().links[0].position[0]);
     let expected = gait(folder.path(), &["--internal-step", "1/250", "--torque-step", "0.01", "--seconds", "2"]);
-    assert!((head - expected).abs() < 1e-3, "{head} {expected}");
-    let up = external.sensors(3).up;
-    assert!((up[2] - 1.0).abs() < 1e-2, "{up:?}");
+    assert!((f64::from(snake.head()[0]) - expected).abs() < 1e-3, "{:?} {expected}", snake.head());
+    // What the plant's IMU says is what the host works out from the motion.
+    let (theirs, ours) = (external.sensors(&snake, 3), snake.sensors(3));
+    let off = |a: [f32; 3], b: [f32; 3]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    assert!(
+        off(theirs.up, ours.up) < 1e-5 && off(theirs.angular_rate, ours.angular_rate) < 1e-3,
+        "{theirs:?} {ours:?}"
+    );
+    assert!(ours.angular_rate[2].abs() > 0.05, "{ours:?}");
+}
+
+/// The gait's torques at this time, s.
+fn wave(snake: &mut Snake, time: f64) {
+    for module in 0..snake.robot().modules {
+        let phase = std::f64::consts::TAU * time + 2.0 * module as f64;
+        snake.set_torque(module, [(64.0 * phase.sin()) as f32, 0.0]);
+    }
+}
+
+#[test]
+fn the_simulator_moves_as_mujoco_does_under_the_same_law() {
+    let folder = tempfile::tempdir().unwrap();
+    succeed(folder.path(), &["mjcf", "-o", "m.xml"]);
+    for (step, tolerance) in [(0.01, 0.02), (0.005, 0.01), (0.00125, 0.005)] {
+        let robot = Robot { torque_slew: 400.0, physics_step: step, ..Robot::default() };
+        let mut snake = Snake::new(&robot);
+        for count in 0..(10.0 / f64::from(step)).round() as usize {
+            wave(&mut snake, count as f64 * f64::from(step));
+            snake.step();
+        }
+        let head = f64::from(snake.head()[0]);
+        assert!((head / GAIT - 1.0).abs() < tolerance, "{step}: {head}");
+    }
 }
 
 #[test]
@@ -184,9 +210,7 @@ fn a_plant_that_fails_ends_the_run_with_a_sentence() {
     }
 }
 
-// MERGE: not ignored any more when `Snake` can mirror a plant elsewhere (host/src/sil.rs).
 #[test]
-#[ignore = "the snake cannot mirror a plant elsewhere yet"]
 fn an_episode_on_the_bus_is_judged_and_repeats() {
     let folder = tempfile::tempdir().unwrap();
     let plant = format!("'{}' '{}' --internal-step 1/250", interpreter(), plant());

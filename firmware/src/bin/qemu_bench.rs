@@ -11,6 +11,7 @@
 
 use core::hint::black_box;
 
+use composer_firmware::attitude::Attitude;
 use composer_firmware::controller::{BusKind, Config, Controller};
 use composer_firmware::failsafe::BusStatus;
 use composer_shared::kinematics::Chain;
@@ -120,6 +121,10 @@ fn parts(policy: &Policy<'_>, random: &mut Random) {
         format_args!("observation"),
         count(|| observe(black_box(&sensors), 0.5, black_box(&head), black_box(&told))),
     );
+
+    let mut attitude = Attitude::rested(sensors.up);
+    let instructions = count(|| attitude.update(black_box(sensors.angular_rate), black_box([0.3, 0.1, 1.2]), 1e-3));
+    report(format_args!("attitude"), instructions);
 
     let observation = observe(&sensors, 0.5, &head, &told);
     report(format_args!("encode"), count(|| policy.encode(black_box(&observation))));

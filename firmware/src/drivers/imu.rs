@@ -83,8 +83,8 @@ impl core::error::Error for ImuError {}
 /// One sample, in the module's own frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Motion {
-    /// Direction against gravity: the acceleration that is felt, in g; a unit vector at rest.
-    pub up: [f32; 3],
+    /// Specific force: the acceleration that is felt, in g; at rest a unit vector against gravity.
+    pub force: [f32; 3],
     /// Angular rate, rad/s.
     pub rate: [f32; 3],
 }
@@ -146,7 +146,7 @@ impl<S: SpiDevice> Lsm6dso<S> {
         }
         let [rx, ry, rz, ax, ay, az] = words(data);
         let turned = |v: [i16; 3], scale: f32| (self.mounting * Vector3::from(v.map(f32::from)) * scale).into();
-        Ok(Motion { up: turned([ax, ay, az], G_PER_STEP), rate: turned([rx, ry, rz], RATE_PER_STEP) })
+        Ok(Motion { force: turned([ax, ay, az], G_PER_STEP), rate: turned([rx, ry, rz], RATE_PER_STEP) })
     }
 
     fn read<const N: usize>(&mut self, register: u8) -> Result<[u8; N], ImuError> {
@@ -242,16 +242,19 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn at_rest_up_is_a_unit_vector() {
+    fn at_rest_it_feels_one_g() {
         // 1 g at 0.122 mg a step, 1 rad/s at 70 mdps a step: the sensitivities of the datasheet.
         let one_g = (1.0 / 0.122e-3) as i16;
         let one_rad = (1.0f32.to_degrees() / 0.070) as i16;
         let motion = with(&[burst(3, [0, 0, one_rad], [0, 0, one_g])], STRAIGHT, |imu| imu.sample()).unwrap();
-        assert!((motion.up[2] - 1.0).abs() < 1e-3 && motion.up[0] == 0.0, "{motion:?}");
+        assert!((motion.force[2] - 1.0).abs() < 1e-3 && motion.force[0] == 0.0, "{motion:?}");
         assert!((motion.rate[2] - 1.0).abs() < 2e-3, "{motion:?}");
         // Bit 2 is a new temperature, which nobody needs.
         let full = with(&[burst(7, [i16::MIN; 3], [i16::MAX; 3])], STRAIGHT, |imu| imu.sample()).unwrap();
-        assert!((full.up[0] - 4.0).abs() < 0.01 && (full.rate[0] + 2293.76f32.to_radians()).abs() < 0.01, "{full:?}");
+        assert!(
+            (full.force[0] - 4.0).abs() < 0.01 && (full.rate[0] + 2293.76f32.to_radians()).abs() < 0.01,
+            "{full:?}"
+        );
     }
 
     #[test]
@@ -259,7 +262,7 @@ pub(crate) mod tests {
         // The chip's x points down, its z points ahead.
         let mounting = [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]];
         let motion = with(&[burst(3, [-100, 20, 30], [-8197, 0, 0])], mounting, |imu| imu.sample()).unwrap();
-        assert!((motion.up[2] - 1.0).abs() < 1e-3 && motion.up[0] == 0.0 && motion.up[1] == 0.0, "{motion:?}");
+        assert!((motion.force[2] - 1.0).abs() < 1e-3 && motion.force[0] == 0.0 && motion.force[1] == 0.0, "{motion:?}");
         let steps = motion.rate.map(|r| r / RATE_PER_STEP);
         assert!(steps.iter().zip([30.0, 20.0, 100.0]).all(|(a, b)| (a - b).abs() < 1e-3), "{steps:?}");
     }

@@ -1,7 +1,7 @@
 //! Device drivers over `embedded-hal` 1.0 traits: they run on any board that implements those, and on the host against mocks.
 //!
 //! - [`encoder`]: the angle of a joint, AS5047P over SPI.
-//! - [`imu`]: the direction against gravity and the angular rate, LSM6DSO over SPI.
+//! - [`imu`]: specific force and angular rate, LSM6DSO over SPI.
 //! - [`motor`]: an H-bridge with a current loop.
 //! - [`thermistor`]: the temperature of a motor.
 //! - [`sensors`]: all of a module's sensors together, as the controller wants them.

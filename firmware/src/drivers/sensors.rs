@@ -9,13 +9,14 @@ use embedded_hal::delay::DelayNs;
 use embedded_hal::spi::SpiDevice;
 
 use super::encoder::{As5047p, EncoderError, JointCalibration, SpeedEstimator};
-use super::imu::{ImuError, Lsm6dso, Motion};
+use super::imu::{ImuError, Lsm6dso};
+use crate::attitude::Attitude;
 
 /// Failures in a row that are bridged.
 pub const HOLD: u8 = 4;
 
 /// Bandwidth of the speed estimate, rad/s: 25 Hz, two and a half times what a control period of 50 ms can use.
-const SPEED_BANDWIDTH: f32 = 157.0;
+pub const SPEED_BANDWIDTH: f32 = 157.0;
 
 /// A joint with its encoder.
 #[derive(Debug)]
@@ -73,17 +74,19 @@ pub struct ModuleSensors<E, I, D> {
     /// Joints that exist.
     count: usize,
     imu: Lsm6dso<I>,
-    motion: Motion,
+    attitude: Attitude,
+    rate: [f32; 3],
+    /// Time since the last good reading of the inertial sensor, s.
+    imu_since: f32,
     imu_failures: u8,
     imu_error: Option<ImuError>,
 }
 
-const UNKNOWN: Motion = Motion { up: [f32::NAN; 3], rate: [f32::NAN; 3] };
-
 impl<E: SpiDevice, I: SpiDevice, D: DelayNs> ModuleSensors<E, I, D> {
     /// The sensors of a module whose first `count` joints exist; the others read 0 and their encoders are left alone.
     pub fn new(joints: [Joint<E, D>; MAX_JOINTS], count: usize, imu: Lsm6dso<I>) -> Self {
-        ModuleSensors { joints, count, imu, motion: UNKNOWN, imu_failures: 0, imu_error: None }
+        let (attitude, rate) = (Attitude::UNKNOWN, [f32::NAN; 3]);
+        ModuleSensors { joints, count, imu, attitude, rate, imu_since: 0.0, imu_failures: 0, imu_error: None }
     }
 
     /// Sets up the inertial sensor: at the start, and whenever [`ModuleSensors::imu_lost`].
@@ -94,7 +97,8 @@ impl<E: SpiDevice, I: SpiDevice, D: DelayNs> ModuleSensors<E, I, D> {
         result
     }
 
-    /// Reads everything, `seconds` after the last time. `torque` (fractions of the limit) and `temperature` (degrees Celsius) come from the motors.
+    /// Reads everything, `seconds` after the last time; every reading of the inertial sensor goes through the [attitude filter](crate::attitude).
+    /// `torque` (fractions of the limit) and `temperature` (degrees Celsius) come from the motors.
     pub fn sample(&mut self, seconds: f32, torque: [f32; AXES], temperature: f32) -> Sensors {
         let mut sensors = Sensors { torque, temperature, ..Sensors::ZERO };
         let readings = sensors.joint_angles.iter_mut().zip(&mut sensors.joint_speeds);
@@ -102,20 +106,22 @@ impl<E: SpiDevice, I: SpiDevice, D: DelayNs> ModuleSensors<E, I, D> {
             joint.read(seconds);
             (*angle, *speed) = (joint.angle, joint.speed);
         }
+        self.imu_since += seconds;
         match self.imu.sample() {
             Ok(motion) => {
-                self.motion = motion;
-                (self.imu_failures, self.imu_error) = (0, None);
+                self.attitude.update(motion.rate, motion.force, self.imu_since);
+                self.rate = motion.rate;
+                (self.imu_since, self.imu_failures, self.imu_error) = (0.0, 0, None);
             }
             Err(error) => {
                 self.imu_error = Some(error);
                 self.imu_failures = self.imu_failures.saturating_add(1);
                 if self.imu_failures > HOLD {
-                    self.motion = UNKNOWN;
+                    (self.attitude, self.rate) = (Attitude::UNKNOWN, [f32::NAN; 3]);
                 }
             }
         }
-        (sensors.up, sensors.angular_rate) = (self.motion.up, self.motion.rate);
+        (sensors.up, sensors.angular_rate) = (self.attitude.up(), self.rate);
         sensors
     }
 
@@ -231,6 +237,20 @@ mod tests {
             chips.done();
         }
         assert!(module.imu_lost() && module.errors().1 == Some(ImuError::Stale));
+    }
+
+    #[test]
+    fn an_impact_does_not_tilt_it() {
+        let (mut module, mut chips) = module(4);
+        let mut sample = |level: [i16; 3]| {
+            chips.answer(&[Some(0); 4], burst(3, [0, 0, 0], level));
+            let sensors = module.sample(1e-3, [0.0; 2], 30.0);
+            chips.done();
+            sensors
+        };
+        (0..500).for_each(|_| _ = sample(LEVEL));
+        let hit = sample([i16::MAX, 0, i16::MIN]);
+        assert!(hit.plausible() && hit.up[2] > 0.999, "{hit:?}");
     }
 
     #[test]

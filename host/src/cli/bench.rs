@@ -3,7 +3,7 @@
 mod firmware;
 
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use anyhow::Result;
 use composer_shared::policy::Task;
@@ -11,9 +11,9 @@ use composer_sim_bridge::sil::{self, SilConfig};
 
 use super::PolicySource;
 use crate::env::{EnvConfig, SnakeEnv};
-use crate::environment::{Environment, View};
+use crate::environment::{Environment, Told, Trivial, View};
 use crate::eval::{Pilot, episode_seed, parallel};
-use crate::methods::Method;
+use crate::methods::{Differentiation, Method};
 use crate::robot::Robot;
 use crate::run::RunConfig;
 use crate::sil::SnakePlant;
@@ -87,6 +87,39 @@ fn training(config: &RunConfig, seconds: f64) -> Result<Times> {
     Ok(times)
 }
 
+/// One way to learn, and what its iterations took.
+struct Learning {
+    gradient: Differentiation,
+    threads: usize,
+    trainer: Trainer,
+    /// Milliseconds for inference and for the update of 2,048 environment steps.
+    milliseconds: Vec<[f64; 2]>,
+}
+
+/// Learning with environments that cost nothing, for each way to the gradient on one thread and on all. They take turns, so that other
+/// load on the machine slows all of them alike.
+fn learning(modules: usize, cores: usize, seconds: f64) -> Result<Vec<Learning>> {
+    let make = |_: usize| -> Result<Box<dyn Environment>> { Ok(Box::new(Trivial::new(modules, Told::Head))) };
+    let mut ways = Vec::new();
+    for gradient in [Differentiation::Manual, Differentiation::Automatic] {
+        for threads in if cores > 1 { vec![1, cores] } else { vec![1] } {
+            let config = TrainConfig { gradient, threads, ..TrainConfig::default() };
+            let mut trainer = Trainer::new(&config, &make, "benchmark")?;
+            trainer.iterate()?;
+            ways.push(Learning { gradient, threads, trainer, milliseconds: Vec::new() });
+        }
+    }
+    let start = Instant::now();
+    while start.elapsed().as_secs_f64() < seconds * ways.len() as f64 || ways[0].milliseconds.len() < 3 {
+        for way in &mut ways {
+            let times = way.trainer.iterate()?.times;
+            let of = |part: Duration| 1e3 * part.as_secs_f64() * 2048.0 / times.steps as f64;
+            way.milliseconds.push([of(times.inference), of(times.update)]);
+        }
+    }
+    Ok(ways)
+}
+
 /// Virtual time by wall time of one thread, whole episodes on the bus.
 fn bus(image: &[u8], robot: &Robot, seconds: f64) -> Result<(f64, f64)> {
     let config = Arc::new(EnvConfig::new(Task::GoalReaching, robot.clone()));
@@ -137,6 +170,19 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             "{:>24} {:>20.0} {physics:>7.0} % {inference:>8.0} % {update:>5.0} %",
             method.name(),
             times.steps_per_second()
+        );
+    }
+    println!("\nlearning alone, {} modules, ms for 2,048 environment steps: median (least)", robot.modules);
+    println!("{:>12} {:>8} {:>16} {:>16}", "gradient", "threads", "inference", "update");
+    for mut way in learning(robot.modules, cores, seconds)? {
+        let [inference, update] = [0, 1].map(|part| {
+            way.milliseconds.sort_by(|a, b| a[part].total_cmp(&b[part]));
+            format!("{:.0} ({:.0})", way.milliseconds[way.milliseconds.len() / 2][part], way.milliseconds[0][part])
+        });
+        println!(
+            "{:>12} {:>8} {inference:>16} {update:>16}",
+            format!("{:?}", way.gradient).to_lowercase(),
+            way.threads
         );
     }
     if let Ok(PolicySource::Image(image)) = PolicySource::load("goal-reaching") {

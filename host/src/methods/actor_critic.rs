@@ -1,15 +1,14 @@
-//! The actor and the critic as burn computes their gradients, over flat parameter vectors.
+//! What the actor and the critic are made of: layouts of their flat parameter vectors, batches of experience, and losses with gradients.
 //!
 //! The actor of the control policy is the network of [`crate::network`]: encoder, optional attention, hidden layer, two outputs a module,
 //! and a standard deviation that does not depend on the state. That of the imagination policy is the same without attention and with
 //! three outputs. The critic sees the whole team: the same two layers for every module, then the mean
 //! over the modules beside the head module's embedding, so that it works for any number of modules.
+//!
+//! [`super::actor`] and [`super::critic`] compute them and their gradients; [`super::autodiff`] does it once more with burn.
 
-use burn::tensor::activation::softmax;
-use burn::tensor::{Device, Tensor, TensorData};
 use composer_shared::observation::SIZE;
 
-use super::fused::bias_tanh;
 use super::imagination::DISPLACEMENT;
 use super::{Block, Method, Stream, lay_out, orthogonal, stream};
 use crate::environment::PRIVILEGED;
@@ -27,9 +26,6 @@ pub const HIDDEN: usize = 64;
 pub const OUT: usize = 2;
 /// What the critic knows of a module.
 pub const CRITIC_INPUT: usize = SIZE + PRIVILEGED;
-
-/// Added to the score of a module that is not heard.
-const UNHEARD: f32 = -1e9;
 
 /// Where things are in an actor's parameters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -249,31 +245,82 @@ impl CriticLayout {
     }
 }
 
-/// A batch of samples (one sample is one step of one environment), padded to the same number of modules.
+/// A batch of samples (one sample is one step of one environment) of any numbers of modules; a row is one module of one sample.
 #[derive(Clone, Debug, Default)]
 pub struct Batch {
-    /// Samples.
-    pub samples: usize,
-    /// Modules in each, with padding.
-    pub modules: usize,
-    /// Normalised observations, `[samples, modules, SIZE]`.
+    /// Modules of each sample.
+    pub modules: Vec<usize>,
+    /// Normalised observations, `[rows, SIZE]`.
     pub observations: Vec<f32>,
-    /// Normalised observation and privileged numbers, `[samples, modules, CRITIC_INPUT]`.
-    pub critic_inputs: Vec<f32>,
-    /// Who hears whom, one mask a module, own bit set.
+    /// Normalised privileged numbers, `[rows, PRIVILEGED]`.
+    pub privileged: Vec<f32>,
+    /// Who hears whom, one mask a row, own bit set; bit i stands for module i of the sample.
     pub heard: Vec<u64>,
-    /// Modules present in each sample; those behind them are padding.
-    pub present: Vec<usize>,
-    /// Weight of each module in the actor's loss: 0 for dead modules and padding.
+    /// Weight of each row in the actor's loss: 0 for dead modules.
     pub weights: Vec<f32>,
-    /// Actions taken, `[samples, modules, outputs]`.
+    /// Actions taken, `[rows, outputs]`.
     pub actions: Vec<f32>,
-    /// Logarithm of the density with which each was taken, `[samples, modules]`.
+    /// Logarithm of the density with which each was taken, `[rows]`.
     pub log_probabilities: Vec<f32>,
     /// Advantage of each sample.
     pub advantages: Vec<f32>,
     /// What the critic should say of each sample, on the critic's scale.
     pub targets: Vec<f32>,
+}
+
+impl Batch {
+    /// Samples in the batch.
+    pub fn samples(&self) -> usize {
+        self.modules.len()
+    }
+
+    /// Modules of all samples together.
+    pub fn rows(&self) -> usize {
+        self.heard.len()
+    }
+
+    /// Empties the batch and keeps its memory.
+    pub fn clear(&mut self) {
+        let Self { modules, observations, privileged, heard, weights, actions, log_probabilities, advantages, targets } =
+            self;
+        modules.clear();
+        heard.clear();
+        for numbers in [observations, privileged, weights, actions, log_probabilities, advantages, targets] {
+            numbers.clear();
+        }
+    }
+}
+
+/// The same parameters with each of `blocks` the other way round: one row per input where there was one per output.
+pub(crate) fn transpose(parameters: &[f32], blocks: &[Block], to: &mut [f32]) {
+    for block in blocks {
+        let (from, to) = (&parameters[block.range()], &mut to[block.range()]);
+        for (row, from) in from.chunks_exact(block.columns.max(1)).enumerate() {
+            for (column, x) in from.iter().enumerate() {
+                to[column * block.rows + row] = *x;
+            }
+        }
+    }
+}
+
+/// Undoes [`transpose`].
+pub(crate) fn transpose_back(transposed: &[f32], blocks: &[Block], to: &mut [f32]) {
+    for block in blocks {
+        let (from, to) = (&transposed[block.range()], &mut to[block.range()]);
+        for (row, to) in to.chunks_exact_mut(block.columns.max(1)).enumerate() {
+            for (column, x) in to.iter_mut().enumerate() {
+                *x = from[column * block.rows + row];
+            }
+        }
+    }
+}
+
+/// The first `len` numbers of `memory`, which grows if it must and is not cleared.
+pub(crate) fn room(memory: &mut Vec<f32>, len: usize) -> &mut [f32] {
+    if memory.len() < len {
+        memory.resize(len, 0.0);
+    }
+    &mut memory[..len]
 }
 
 /// A loss summed over a batch, its gradient, and what else is told about it.
@@ -290,49 +337,20 @@ pub struct Gradient {
 }
 
 impl Gradient {
+    /// Nothing yet, over `len` parameters.
+    pub fn clear(&mut self, len: usize) {
+        self.gradient.clear();
+        self.gradient.resize(len, 0.0);
+        (self.loss, self.kl, self.clipped) = (0.0, 0.0, 0.0);
+    }
+
     /// Adds another batch's.
     pub fn add(&mut self, other: &Gradient) {
-        if self.gradient.is_empty() {
-            self.gradient = other.gradient.clone();
-        } else {
-            self.gradient.iter_mut().zip(&other.gradient).for_each(|(a, b)| *a += b);
-        }
+        self.gradient.iter_mut().zip(&other.gradient).for_each(|(a, b)| *a += b);
         self.loss += other.loss;
         self.kl += other.kl;
         self.clipped += other.clipped;
     }
-}
-
-/// A tensor for each block that has any numbers; they require gradients if the device does autodiff.
-fn tensors<const N: usize>(parameters: &[f32], blocks: [Block; N], device: &Device) -> [Option<Tensor<2>>; N] {
-    blocks.map(|block| {
-        (!block.is_empty()).then(|| {
-            let data = TensorData::new(parameters[block.range()].to_vec(), [block.rows, block.columns]);
-            let tensor = Tensor::from_data(data, device);
-            if tensor.is_autodiff() { tensor.require_grad() } else { tensor }
-        })
-    })
-}
-
-fn floats<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
-    tensor.into_data().try_to_vec::<f32>().expect("the flex backend computes in f32")
-}
-
-/// Reads the gradients of `tensors` out, in the order of `blocks`.
-fn collect<const N: usize>(
-    loss: &Tensor<1>,
-    tensors: [Option<Tensor<2>>; N],
-    blocks: [Block; N],
-    len: usize,
-) -> Vec<f32> {
-    let mut gradients = loss.backward();
-    let mut flat = vec![0.0; len];
-    for (tensor, block) in tensors.into_iter().zip(blocks) {
-        if let Some(gradient) = tensor.and_then(|tensor| tensor.grad_remove(&mut gradients)) {
-            flat[block.range()].copy_from_slice(&floats(gradient));
-        }
-    }
-    flat
 }
 
 /// What PPO's clipped loss needs besides the batch.
@@ -342,86 +360,8 @@ pub struct PpoLoss {
     pub clip: f32,
 }
 
-impl ActorLayout {
-    /// Means of the actions, `[samples * modules, outputs]`.
-    fn forward(&self, p: &[Option<Tensor<2>>; 9], batch: &Batch, device: &Device) -> Tensor<2> {
-        let [encoder, encoder_bias, attention, hidden, hidden_context, hidden_bias, output, output_bias, _] = p;
-        let [Some(encoder), Some(encoder_bias), Some(hidden), Some(hidden_bias), Some(output), Some(output_bias)] =
-            [encoder, encoder_bias, hidden, hidden_bias, output, output_bias].map(Clone::clone)
-        else {
-            unreachable!("only the blocks of attention may be empty");
-        };
-        let (samples, modules) = (batch.samples, batch.modules);
-        let rows = samples * modules;
-        let x = Tensor::<2>::from_data(TensorData::new(batch.observations.clone(), [rows, SIZE]), device);
-        let e = bias_tanh(x.matmul(encoder.transpose()), encoder_bias);
-        let mut h = e.clone().matmul(hidden.transpose());
-        if let (Some(attention), Some(hidden_context)) = (attention.clone(), hidden_context.clone()) {
-            let qkv = e.matmul(attention.transpose()).reshape([samples, modules, 2 * KEY + VALUE]);
-            let q = qkv.clone().slice([0..samples, 0..modules, 0..KEY]);
-            let k = qkv.clone().slice([0..samples, 0..modules, KEY..2 * KEY]);
-            let v = qkv.slice([0..samples, 0..modules, 2 * KEY..2 * KEY + VALUE]);
-            let mut mask = vec![0.0f32; rows * modules];
-            for (row, heard) in batch.heard.iter().enumerate() {
-                for other in 0..modules {
-                    if heard >> other & 1 == 0 {
-                        mask[row * modules + other] = UNHEARD;
-                    }
-                }
-            }
-            let mask = Tensor::<3>::from_data(TensorData::new(mask, [samples, modules, modules]), device);
-            let scores = q.matmul(k.swap_dims(1, 2)) * (KEY as f32).sqrt().recip() + mask;
-            let context = softmax(scores, 2).matmul(v).reshape([rows, VALUE]);
-            h = h + context.matmul(hidden_context.transpose());
-        }
-        bias_tanh(h, hidden_bias).matmul(output.transpose()) + output_bias
-    }
-
-    /// Means of the actions of a batch, without gradients: what training believes the policy says.
-    pub fn means(&self, parameters: &[f32], batch: &Batch) -> Vec<f32> {
-        let device = Device::flex();
-        floats(self.forward(&tensors(parameters, self.blocks(), &device), batch, &device))
-    }
-
-    /// PPO's clipped loss over a batch, and its gradient.
-    pub fn gradient(&self, parameters: &[f32], batch: &Batch, loss: PpoLoss) -> Gradient {
-        let device = Device::flex().autodiff();
-        let rows = batch.samples * batch.modules;
-        let tensors = tensors(parameters, self.blocks(), &device);
-        let mean = self.forward(&tensors, batch, &device);
-        let column =
-            |data: Vec<f32>, columns: usize| Tensor::<2>::from_data(TensorData::new(data, [rows, columns]), &device);
-        let Some(log_sigma) = tensors[8].clone() else { unreachable!("log sigma is never empty") };
-        let actions = column(batch.actions.clone(), self.outputs());
-        let advantages = batch.advantages.iter().flat_map(|a| std::iter::repeat_n(*a, batch.modules)).collect();
-        let advantages = column(advantages, 1);
-        let weights = column(batch.weights.clone(), 1);
-        // Constants of the density cancel in the ratio, but log sigma does not: it is being learnt.
-        let constant = self.outputs() as f32 * LOG_DENSITY_CONSTANT;
-        let offset = batch.log_probabilities.iter().map(|l| l + constant).collect();
-        let distance = (actions - mean) * log_sigma.clone().neg().exp();
-        let log_ratio = (distance.clone() * distance).sum_dim(1) * -0.5 - log_sigma.sum_dim(1) - column(offset, 1);
-        let ratio = log_ratio.clone().exp();
-        let gain = ratio.clone() * advantages.clone();
-        let clipped = ratio.clone().clamp(1.0 - loss.clip, 1.0 + loss.clip) * advantages;
-        let total = (gain.min_pair(clipped) * weights).sum().neg();
-        let log_ratio = floats(log_ratio.inner());
-        let gradient = collect(&total, tensors, self.blocks(), self.len);
-        let mut result = Gradient { gradient, loss: f64::from(total.into_scalar::<f32>()), ..Gradient::default() };
-        for (log_ratio, weight) in log_ratio.iter().zip(&batch.weights) {
-            let (log_ratio, weight) = (f64::from(*log_ratio), f64::from(*weight));
-            let ratio = log_ratio.exp();
-            result.kl += weight * (ratio - 1.0 - log_ratio);
-            if (ratio - 1.0).abs() > f64::from(loss.clip) {
-                result.clipped += weight;
-            }
-        }
-        result
-    }
-}
-
 /// ln(2 pi) / 2, for each action dimension. Its last digit does not count: it cancels in every ratio.
-const LOG_DENSITY_CONSTANT: f32 = 0.918_938_6;
+pub(crate) const LOG_DENSITY_CONSTANT: f32 = 0.918_938_6;
 
 /// Logarithm of the density of `action` under independent normals of mean `mean` and standard deviation exp(`log_sigma`).
 pub fn log_probability<const A: usize>(action: [f32; A], mean: [f32; A], log_sigma: [f32; A]) -> f32 {
@@ -431,55 +371,4 @@ pub fn log_probability<const A: usize>(action: [f32; A], mean: [f32; A], log_sig
         sum -= 0.5 * distance * distance + log_sigma[i];
     }
     sum
-}
-
-impl CriticLayout {
-    /// Values of a batch on the critic's scale, `[samples, 1]`.
-    fn forward(&self, p: &[Option<Tensor<2>>; 8], batch: &Batch, device: &Device) -> Tensor<2> {
-        let [
-            Some(first),
-            Some(first_bias),
-            Some(second),
-            Some(second_bias),
-            Some(team),
-            Some(team_bias),
-            Some(value),
-            Some(value_bias),
-        ] = p.each_ref().map(|tensor| tensor.clone())
-        else {
-            unreachable!("no block of the critic is empty");
-        };
-        let (samples, modules) = (batch.samples, batch.modules);
-        let rows = samples * modules;
-        let x = Tensor::<2>::from_data(TensorData::new(batch.critic_inputs.clone(), [rows, CRITIC_INPUT]), device);
-        let h = bias_tanh(x.matmul(first.transpose()), first_bias);
-        let h = bias_tanh(h.matmul(second.transpose()), second_bias).reshape([samples, modules, EMBED]);
-        // Row 0 takes the mean over the modules that are there, row 1 the head.
-        let mut pool = vec![0.0f32; 2 * rows];
-        for (pool, present) in pool.chunks_exact_mut(2 * modules).zip(&batch.present) {
-            pool[..*present].fill(1.0 / *present as f32);
-            pool[modules] = 1.0;
-        }
-        let pool = Tensor::<3>::from_data(TensorData::new(pool, [samples, 2, modules]), device);
-        let pooled = pool.matmul(h).reshape([samples, 2 * EMBED]);
-        let h = bias_tanh(pooled.matmul(team.transpose()), team_bias);
-        h.matmul(value.transpose()) + value_bias
-    }
-
-    /// Values of a batch on the critic's scale.
-    pub fn values(&self, parameters: &[f32], batch: &Batch) -> Vec<f32> {
-        let device = Device::flex();
-        floats(self.forward(&tensors(parameters, self.blocks(), &device), batch, &device))
-    }
-
-    /// Half the squared error over a batch times `weight`, and its gradient.
-    pub fn gradient(&self, parameters: &[f32], batch: &Batch, weight: f32) -> Gradient {
-        let device = Device::flex().autodiff();
-        let tensors = tensors(parameters, self.blocks(), &device);
-        let targets = Tensor::<2>::from_data(TensorData::new(batch.targets.clone(), [batch.samples, 1]), &device);
-        let error = self.forward(&tensors, batch, &device) - targets;
-        let loss = (error.clone() * error).sum() * (0.5 * weight);
-        let gradient = collect(&loss, tensors, self.blocks(), self.len);
-        Gradient { gradient, loss: f64::from(loss.into_scalar::<f32>()), ..Gradient::default() }
-    }
 }

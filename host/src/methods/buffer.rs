@@ -3,7 +3,7 @@
 
 use composer_shared::observation::SIZE;
 
-use super::actor_critic::{Batch, CRITIC_INPUT, OUT};
+use super::actor_critic::{Batch, OUT};
 use super::imagination::DISPLACEMENT;
 use crate::environment::{Outcome, PRIVILEGED};
 
@@ -139,74 +139,31 @@ impl<const A: usize> Track<A> {
     }
 }
 
-/// Gathers (lane, step) samples into a batch padded to `modules` modules; track i belongs to lane i.
+/// Gathers (lane, step) samples into `batch` in place of what it held; track i belongs to lane i.
 ///
 /// `weight` is what a module that acts weighs in the actor's loss. Everything a policy was limited by in the rollout (who heard whom,
 /// who acted) comes along, or the ratio of the new to the old policy would be wrong.
 pub fn gather<const A: usize>(
     (lanes, tracks): (&[Lane], &[Track<A>]),
     samples: &[(u32, u32)],
-    modules: usize,
     weight: f32,
     target: impl Fn(f32) -> f32,
-) -> Batch {
-    let rows = samples.len() * modules;
-    let mut batch = Batch {
-        samples: samples.len(),
-        modules,
-        observations: Vec::with_capacity(rows * SIZE),
-        critic_inputs: Vec::with_capacity(rows * CRITIC_INPUT),
-        heard: Vec::with_capacity(rows),
-        present: Vec::with_capacity(samples.len()),
-        weights: Vec::with_capacity(rows),
-        actions: Vec::with_capacity(rows * A),
-        log_probabilities: Vec::with_capacity(rows),
-        advantages: Vec::with_capacity(samples.len()),
-        targets: Vec::with_capacity(samples.len()),
-    };
+    batch: &mut Batch,
+) {
+    batch.clear();
     for (lane, step) in samples {
         let (lane, track, step) = (&lanes[*lane as usize], &tracks[*lane as usize], *step as usize);
         let n = lane.modules;
         let at = step * n..(step + 1) * n;
-        batch.observations.extend_from_slice(&lane.observations[step * n * SIZE..(step + 1) * n * SIZE]);
-        for module in at.clone() {
-            batch.critic_inputs.extend_from_slice(&lane.observations[module * SIZE..(module + 1) * SIZE]);
-            batch.critic_inputs.extend_from_slice(&lane.privileged[module * PRIVILEGED..(module + 1) * PRIVILEGED]);
-        }
+        batch.modules.push(n);
+        batch.observations.extend_from_slice(&lane.observations[at.start * SIZE..at.end * SIZE]);
+        batch.privileged.extend_from_slice(&lane.privileged[at.start * PRIVILEGED..at.end * PRIVILEGED]);
         batch.heard.extend_from_slice(&lane.heard[at.clone()]);
-        batch.present.push(n);
         batch.weights.extend(lane.acts[at.clone()].iter().map(|acts| if *acts { weight } else { 0.0 }));
         batch.actions.extend_from_slice(track.actions[at.clone()].as_flattened());
         batch.log_probabilities.extend_from_slice(&track.log_probabilities[at]);
         batch.advantages.push(track.advantages.get(step).copied().unwrap_or(0.0));
         batch.targets.push(target(track.returns.get(step).copied().unwrap_or(0.0)));
-        pad::<A>(&mut batch, n);
-    }
-    batch
-}
-
-/// A batch for a critic alone, of what a lane holds: `[sample][module][SIZE]` and `[sample][module][PRIVILEGED]`.
-pub fn gather_critic(modules: usize, observations: &[f32], privileged: &[f32]) -> Batch {
-    let rows = observations.len() / SIZE;
-    let samples = rows / modules.max(1);
-    let mut batch = Batch { samples, modules, present: vec![modules; samples], ..Batch::default() };
-    for row in 0..rows {
-        batch.critic_inputs.extend_from_slice(&observations[row * SIZE..(row + 1) * SIZE]);
-        batch.critic_inputs.extend_from_slice(&privileged[row * PRIVILEGED..(row + 1) * PRIVILEGED]);
-    }
-    batch
-}
-
-/// Fills the sample that was appended last up to the batch's number of modules: padding observes zeros, hears itself alone (its
-/// attention must not divide by zero), and is heard by nobody because no mask has its bit.
-fn pad<const A: usize>(batch: &mut Batch, present: usize) {
-    for module in present..batch.modules {
-        batch.observations.extend_from_slice(&[0.0; SIZE]);
-        batch.critic_inputs.extend_from_slice(&[0.0; CRITIC_INPUT]);
-        batch.heard.push(1 << module);
-        batch.weights.push(0.0);
-        batch.actions.extend_from_slice(&[0.0; A]);
-        batch.log_probabilities.push(0.0);
     }
 }
 
@@ -253,28 +210,37 @@ mod tests {
     }
 
     #[test]
-    fn padding_weighs_nothing_and_is_heard_by_nobody() {
-        let mut short = Lane { rewards: vec![0.0; 2], ..Lane::default() };
-        short.modules = 2;
-        short.observations = vec![1.0; 2 * 2 * SIZE];
-        short.privileged = vec![2.0; 2 * 2 * PRIVILEGED];
-        short.heard = vec![3; 4];
-        short.acts = vec![true, false, true, true];
-        let track = Track {
-            actions: vec![[0.5, 0.25, -0.5]; 4],
-            log_probabilities: vec![-1.0; 4],
+    fn samples_of_different_lengths_lie_one_after_the_other() {
+        let lane = |modules: usize| Lane {
+            modules,
+            rewards: vec![0.0; 2],
+            observations: (0..2 * modules * SIZE).map(|i| i as f32).collect(),
+            privileged: (0..2 * modules * PRIVILEGED).map(|i| -(i as f32)).collect(),
+            heard: (0..2 * modules as u64).collect(),
+            acts: (0..2 * modules).map(|i| i != 1).collect(),
+            ..Lane::default()
+        };
+        let track = |modules: usize| Track {
+            actions: (0..2 * modules).map(|i| [i as f32, 0.5]).collect(),
+            log_probabilities: (0..2 * modules).map(|i| i as f32).collect(),
             advantages: vec![1.0, 2.0],
             returns: vec![3.0, 4.0],
             ..Track::default()
         };
-        let batch = gather((&[short], &[track]), &[(0, 0), (0, 1)], 3, 0.25, |r| r * 2.0);
-        assert_eq!(batch.weights, [0.25, 0.0, 0.0, 0.25, 0.25, 0.0]);
-        assert_eq!(batch.heard, [3, 3, 4, 3, 3, 4]);
+        let (lanes, tracks) = ([lane(3), lane(2)], [track(3), track(2)]);
+        // What an earlier batch left behind does not matter.
+        let mut batch = Batch { modules: vec![7], weights: vec![7.0], ..Batch::default() };
+        gather((&lanes, &tracks), &[(1, 0), (0, 1)], 0.25, |r| r * 2.0, &mut batch);
+        assert_eq!((batch.samples(), batch.rows()), (2, 5));
+        assert_eq!(batch.modules, [2, 3]);
+        assert_eq!(batch.weights, [0.25, 0.0, 0.25, 0.25, 0.25]);
+        assert_eq!(batch.heard, [0, 1, 3, 4, 5]);
         assert_eq!(batch.targets, [6.0, 8.0]);
-        assert_eq!(batch.present, [2, 2]);
-        assert_eq!(batch.actions[3..12], [0.5, 0.25, -0.5, 0.0, 0.0, 0.0, 0.5, 0.25, -0.5]);
-        assert_eq!(batch.observations.len(), 6 * SIZE);
-        assert_eq!(batch.critic_inputs[CRITIC_INPUT - 1..CRITIC_INPUT + 1], [2.0, 1.0]);
-        assert!(batch.critic_inputs[2 * CRITIC_INPUT..3 * CRITIC_INPUT].iter().all(|x| *x == 0.0));
+        assert_eq!(batch.advantages, [1.0, 2.0]);
+        assert_eq!(batch.log_probabilities, [0.0, 1.0, 3.0, 4.0, 5.0]);
+        assert_eq!(batch.actions[2..6], [1.0, 0.5, 3.0, 0.5]);
+        assert_eq!(batch.observations.len(), 5 * SIZE);
+        assert_eq!(batch.observations[2 * SIZE], (3 * SIZE) as f32);
+        assert_eq!(batch.privileged[2 * PRIVILEGED + 1], -((3 * PRIVILEGED + 1) as f32));
     }
 }

@@ -26,7 +26,7 @@
 use anyhow::{Result, bail};
 use serde::{Deserialize, Serialize};
 
-use super::inference::Inference;
+use super::actor::Actor;
 use crate::environment::Environment;
 use crate::tasks::Point;
 
@@ -82,7 +82,7 @@ impl ImaginationConfig {
 #[derive(Clone, Copy)]
 pub struct Imagination<'a> {
     /// Its actor.
-    pub policy: &'a Inference<DISPLACEMENT>,
+    pub policy: &'a Actor,
     /// Seed of its random streams.
     pub seed: u64,
     /// Longest displacement, units.
@@ -141,10 +141,8 @@ mod tests {
     #[test]
     fn a_dead_module_stays_and_is_left_out_of_the_following_error() {
         let team = Trivial::new(3, Told::All);
-        let policy = Inference::new(
-            &crate::methods::actor_critic::ActorLayout::imagination(),
-            &vec![0.0; crate::methods::actor_critic::ActorLayout::imagination().len],
-        );
+        let layout = crate::methods::actor_critic::ActorLayout::imagination();
+        let policy = Actor::new(layout, &vec![0.0; layout.len]);
         let imagination = Imagination { policy: &policy, seed: 0, bound: 1.0, follow: 1.0 };
         let acts = [true, false, true];
         let mut imagined = Vec::new();

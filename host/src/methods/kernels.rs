@@ -1,151 +1,244 @@
-//! The few inner loops that training spends its time in, in a form that compilers turn into vector instructions.
+//! The inner loops that training spends its time in: products with the narrow matrices of the networks, tanh, and their ways back.
 //!
-//! On x86-64 with AVX2 and FMA a second copy of each is compiled for those and chosen at run time.
+//! Each is compiled for AVX-512, for AVX2 with FMA and for the bare target; the best that the processor has is chosen at run time. Every
+//! number is summed in an order that depends on neither the width of the registers nor the number of rows, so both x86-64 copies give the
+//! same bits, and a row has the same result alone as among others.
 
-/// Rows computed at a time.
-const ROWS: usize = 4;
-/// Columns computed at a time.
-const COLUMNS: usize = 16;
+use super::simd::{Vector, vectorise};
 
-/// Whether the copies for AVX2 and FMA may be used.
-#[cfg(target_arch = "x86_64")]
-fn fast() -> bool {
-    std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma")
+/// What a product starts from.
+#[derive(Clone, Copy)]
+pub enum Start<'a> {
+    /// Nothing.
+    Zero,
+    /// The same row for all.
+    Bias(&'a [f32]),
+    /// What is there already.
+    Sum,
 }
 
-/// `y = x w + bias` (or `y += x w` without a bias), row by row.
+/// The longest row that [`Start::Zero`] can begin.
+const LONGEST: usize = 256;
+static ZERO: [f32; LONGEST] = [0.0; LONGEST];
+
+/// `y = start + x w`: `x` is `[rows][inputs]`, `w` is `[inputs][outputs]`, `y` is `[rows][outputs]`; outputs is a multiple of 32.
 ///
-/// `x` is `[rows][inputs]`, `w` is `[inputs][OUTPUTS]`, `y` is `[rows][OUTPUTS]`; OUTPUTS is a multiple of 16.
-pub fn dense<const OUTPUTS: usize>(x: &[f32], inputs: usize, w: &[f32], bias: Option<&[f32]>, y: &mut [f32]) {
-    assert!(OUTPUTS.is_multiple_of(COLUMNS) && w.len() == inputs * OUTPUTS && x.len() / inputs == y.len() / OUTPUTS);
-    if let Some(bias) = bias {
-        y.chunks_exact_mut(OUTPUTS).for_each(|y| y.copy_from_slice(bias));
-    }
-    #[cfg(target_arch = "x86_64")]
-    if fast() {
-        // SAFETY: the processor has AVX2 and FMA.
-        unsafe { dense_fma::<OUTPUTS>(x, inputs, w, y) };
-        return;
-    }
-    dense_body::<OUTPUTS>(x, inputs, w, y, |a, b, c| a * b + c);
+/// With `w` one row per input this is the way forth of a layer; with `w` one row per output it is the way back from the gradient of the
+/// outputs to that of the inputs.
+pub fn dense(x: &[f32], inputs: usize, w: &[f32], start: Start, y: &mut [f32]) {
+    let outputs = w.len() / inputs;
+    let rows = x.len() / inputs;
+    assert!(x.len() == rows * inputs && w.len() == inputs * outputs && y.len() == rows * outputs);
+    let (start, start_stride) = match start {
+        Start::Zero => (&ZERO[..outputs], 0),
+        Start::Bias(bias) => (&bias[..outputs], 0),
+        Start::Sum => (&[][..], outputs),
+    };
+    product(
+        Product { a: x, a_row: inputs, a_step: 1, b: w, steps: inputs, start, start_stride, rows, columns: outputs },
+        y,
+    );
 }
 
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2,fma")]
-fn dense_fma<const OUTPUTS: usize>(x: &[f32], inputs: usize, w: &[f32], y: &mut [f32]) {
-    dense_body::<OUTPUTS>(x, inputs, w, y, |a, b, c| a.mul_add(b, c));
+/// `of_w += x^T of_y`, the gradient of a layer's weights, one row per input: `x` is `[rows][inputs]`, `of_y` is `[rows][outputs]`, `of_w`
+/// is `[inputs][outputs]`; outputs is a multiple of 32.
+pub fn dense_weights(x: &[f32], inputs: usize, of_y: &[f32], of_w: &mut [f32]) {
+    let outputs = of_w.len() / inputs;
+    let rows = x.len() / inputs;
+    assert!(x.len() == rows * inputs && of_w.len() == inputs * outputs && of_y.len() == rows * outputs);
+    let (start, start_stride) = (&[][..], outputs);
+    product(
+        Product {
+            a: x,
+            a_row: 1,
+            a_step: inputs,
+            b: of_y,
+            steps: rows,
+            start,
+            start_stride,
+            rows: inputs,
+            columns: outputs,
+        },
+        of_w,
+    );
+}
+
+/// `c[r][j] = start[r][j] + sum_k a[r a_row + k a_step] b[k][j]`, the sum in the order of k.
+#[derive(Clone, Copy)]
+struct Product<'a> {
+    a: &'a [f32],
+    a_row: usize,
+    a_step: usize,
+    /// `[steps][columns]`
+    b: &'a [f32],
+    steps: usize,
+    /// Empty: what is in c.
+    start: &'a [f32],
+    /// Distance between the rows of `start`; 0 if there is one.
+    start_stride: usize,
+    rows: usize,
+    columns: usize,
+}
+
+vectorise! {
+    fn product(p: Product<'_>, c: &mut [f32]) = product_body
 }
 
 #[inline(always)]
-fn dense_body<const OUTPUTS: usize>(
-    x: &[f32],
-    inputs: usize,
-    w: &[f32],
-    y: &mut [f32],
-    fma: impl Fn(f32, f32, f32) -> f32 + Copy,
-) {
-    for column in (0..OUTPUTS).step_by(COLUMNS) {
-        let mut xs = x.chunks_exact(ROWS * inputs);
-        let mut ys = y.chunks_exact_mut(ROWS * OUTPUTS);
-        for (x, y) in xs.by_ref().zip(ys.by_ref()) {
-            tile::<ROWS, OUTPUTS>(x, inputs, w, y, column, fma);
-        }
-        for (x, y) in xs.remainder().chunks_exact(inputs).zip(ys.into_remainder().chunks_exact_mut(OUTPUTS)) {
-            tile::<1, OUTPUTS>(x, inputs, w, y, column, fma);
-        }
-    }
-}
-
-/// Adds to `COLUMNS` columns of `N` rows.
-#[inline(always)]
-fn tile<const N: usize, const OUTPUTS: usize>(
-    x: &[f32],
-    inputs: usize,
-    w: &[f32],
-    y: &mut [f32],
-    column: usize,
-    fma: impl Fn(f32, f32, f32) -> f32,
-) {
-    let mut sums = [[0.0f32; COLUMNS]; N];
-    for (row, sums) in sums.iter_mut().enumerate() {
-        sums.copy_from_slice(&y[row * OUTPUTS + column..][..COLUMNS]);
-    }
-    for (k, w) in w.chunks_exact(OUTPUTS).enumerate() {
-        let w = &w[column..column + COLUMNS];
-        for (row, sums) in sums.iter_mut().enumerate() {
-            let x = x[row * inputs + k];
-            for j in 0..COLUMNS {
-                sums[j] = fma(x, w[j], sums[j]);
+fn product_body<V: Vector>(p: Product, c: &mut [f32]) {
+    let Product { rows, columns, steps, .. } = p;
+    assert!(columns.is_multiple_of(2 * V::LANES) && c.len() == rows * columns && p.b.len() == steps * columns);
+    assert!(rows == 0 || steps == 0 || (rows - 1) * p.a_row + (steps - 1) * p.a_step < p.a.len());
+    assert!(p.start_stride == columns || p.start.len() == columns);
+    // SAFETY: the lengths just checked; `vectorise!` only runs copies for registers that the processor has.
+    unsafe {
+        for column in (0..columns).step_by(2 * V::LANES) {
+            let mut row = 0;
+            if V::REGISTERS >= 32 {
+                while row + 8 <= rows {
+                    tile::<V, 8>(&p, row, column, c);
+                    row += 8;
+                }
+            }
+            while row + 4 <= rows {
+                tile::<V, 4>(&p, row, column, c);
+                row += 4;
+            }
+            while row < rows {
+                tile::<V, 1>(&p, row, column, c);
+                row += 1;
             }
         }
     }
-    for (row, sums) in sums.iter().enumerate() {
-        y[row * OUTPUTS + column..][..COLUMNS].copy_from_slice(sums);
-    }
 }
 
-/// Replaces every number by its hyperbolic tangent, to within 4 units in the last place of 1.
-pub fn tanh(x: &mut [f32]) {
-    #[cfg(target_arch = "x86_64")]
-    if fast() {
-        // SAFETY: the processor has AVX2 and FMA.
-        unsafe { tanh_fma(x) };
-        return;
-    }
-    x.iter_mut().for_each(|x| *x = tanh_body(*x, |a, b, c| a * b + c));
-}
-
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2,fma")]
-fn tanh_fma(x: &mut [f32]) {
-    x.iter_mut().for_each(|x| *x = tanh_body(*x, |a, b, c| a.mul_add(b, c)));
-}
-
-/// Adds `bias` to every row of `x` and replaces it by its hyperbolic tangent.
-pub fn bias_tanh(x: &mut [f32], bias: &[f32]) {
-    #[cfg(target_arch = "x86_64")]
-    if fast() {
-        // SAFETY: the processor has AVX2 and FMA.
-        unsafe { bias_tanh_fma(x, bias) };
-        return;
-    }
-    bias_tanh_body(x, bias, |a, b, c| a * b + c);
-}
-
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2,fma")]
-fn bias_tanh_fma(x: &mut [f32], bias: &[f32]) {
-    bias_tanh_body(x, bias, |a, b, c| a.mul_add(b, c));
-}
-
+/// `N` rows by two registers of columns.
+///
+/// # Safety
+///
+/// All of it must lie inside of what `p` and `c` describe, and the processor must have the registers.
 #[inline(always)]
-fn bias_tanh_body(x: &mut [f32], bias: &[f32], fma: impl Fn(f32, f32, f32) -> f32 + Copy) {
-    for row in x.chunks_exact_mut(bias.len()) {
-        for (x, bias) in row.iter_mut().zip(bias) {
-            *x = tanh_body(*x + bias, fma);
+unsafe fn tile<V: Vector, const N: usize>(p: &Product, row: usize, column: usize, c: &mut [f32]) {
+    // SAFETY: see above.
+    unsafe {
+        let c = c.as_mut_ptr().add(row * p.columns + column);
+        let start = if p.start_stride == 0 { p.start.as_ptr().add(column) } else { c.cast_const() };
+        let mut sums = [[V::splat(0.0); 2]; N];
+        for (i, [left, right]) in sums.iter_mut().enumerate() {
+            *left = V::load(start.add(i * p.start_stride));
+            *right = V::load(start.add(i * p.start_stride + V::LANES));
+        }
+        let mut a = p.a.as_ptr().add(row * p.a_row);
+        let mut b = p.b.as_ptr().add(column);
+        for _ in 0..p.steps {
+            let (b_left, b_right) = (V::load(b), V::load(b.add(V::LANES)));
+            for (i, [left, right]) in sums.iter_mut().enumerate() {
+                let a = V::splat(*a.add(i * p.a_row));
+                *left = a.multiply_add(b_left, *left);
+                *right = a.multiply_add(b_right, *right);
+            }
+            a = a.wrapping_add(p.a_step);
+            b = b.wrapping_add(p.columns);
+        }
+        for (i, [left, right]) in sums.iter().enumerate() {
+            left.store(c.add(i * p.columns));
+            right.store(c.add(i * p.columns + V::LANES));
         }
     }
 }
 
-/// The way back of [`bias_tanh`]: turns the gradient of its output `y` into that of its input, and adds its rows up in `of_bias`.
-pub fn bias_tanh_backward(gradient: &mut [f32], y: &[f32], of_bias: &mut [f32]) {
-    #[cfg(target_arch = "x86_64")]
-    if fast() {
-        // SAFETY: the processor has AVX2 and FMA.
-        unsafe { bias_tanh_backward_fma(gradient, y, of_bias) };
-        return;
+/// The inner product, summed in 16 parts; the lengths are the same and a multiple of 16.
+#[inline(always)]
+pub fn dot<V: Vector>(x: &[f32], y: &[f32]) -> f32 {
+    let mut parts = [0.0f32; 16];
+    for (x, y) in x.chunks_exact(16).zip(y.chunks_exact(16)) {
+        for i in 0..16 {
+            parts[i] = V::scalar(x[i], y[i], parts[i]);
+        }
     }
-    bias_tanh_backward_body(gradient, y, of_bias);
+    for half in [8, 4, 2, 1] {
+        for i in 0..half {
+            parts[i] += parts[i + half];
+        }
+    }
+    parts[0]
 }
 
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2,fma")]
-fn bias_tanh_backward_fma(gradient: &mut [f32], y: &[f32], of_bias: &mut [f32]) {
-    bias_tanh_backward_body(gradient, y, of_bias);
+vectorise! {
+    /// A layer of few outputs: `y = bias + x w^T`, `x` is `[rows][N]`, `w` is `[outputs][N]`, `y` is `[rows][outputs]`.
+    pub fn head[const N: usize](x: &[f32], w: &[f32], bias: &[f32], y: &mut [f32]) = head_body
 }
 
 #[inline(always)]
-fn bias_tanh_backward_body(gradient: &mut [f32], y: &[f32], of_bias: &mut [f32]) {
+fn head_body<V: Vector, const N: usize>(x: &[f32], w: &[f32], bias: &[f32], y: &mut [f32]) {
+    for (x, y) in x.as_chunks::<N>().0.iter().zip(y.chunks_exact_mut(bias.len())) {
+        for ((y, w), bias) in y.iter_mut().zip(w.as_chunks::<N>().0).zip(bias) {
+            *y = bias + dot::<V>(x, w);
+        }
+    }
+}
+
+vectorise! {
+    /// The way back of [`head`]: gradient of its input into `of_x`, of its weights and bias added to `of_w` and `of_bias`.
+    pub fn head_backward[const N: usize](
+        x: &[f32], w: &[f32], of_y: &[f32], of_x: &mut [f32], of_w: &mut [f32], of_bias: &mut [f32]
+    ) = head_backward_body
+}
+
+#[inline(always)]
+fn head_backward_body<V: Vector, const N: usize>(
+    x: &[f32],
+    w: &[f32],
+    of_y: &[f32],
+    of_x: &mut [f32],
+    of_w: &mut [f32],
+    of_bias: &mut [f32],
+) {
+    let rows = x.as_chunks::<N>().0.iter().zip(of_x.as_chunks_mut::<N>().0).zip(of_y.chunks_exact(of_bias.len()));
+    for ((x, of_x), of_y) in rows {
+        *of_x = [0.0; N];
+        let outputs = of_y.iter().zip(w.as_chunks::<N>().0).zip(of_w.as_chunks_mut::<N>().0).zip(&mut *of_bias);
+        for (((of_y, w), of_w), of_bias) in outputs {
+            *of_bias += of_y;
+            for i in 0..N {
+                of_x[i] = V::scalar(*of_y, w[i], of_x[i]);
+                of_w[i] = V::scalar(*of_y, x[i], of_w[i]);
+            }
+        }
+    }
+}
+
+vectorise! {
+    /// Replaces every number by its hyperbolic tangent, to within 4 units in the last place of 1.
+    pub fn tanh(x: &mut [f32]) = tanh_all
+}
+
+#[inline(always)]
+fn tanh_all<V: Vector>(x: &mut [f32]) {
+    x.iter_mut().for_each(|x| *x = tanh_body(*x, V::scalar));
+}
+
+vectorise! {
+    /// Adds `bias` to every row of `x` and replaces it by its hyperbolic tangent.
+    pub fn bias_tanh(x: &mut [f32], bias: &[f32]) = bias_tanh_body
+}
+
+#[inline(always)]
+fn bias_tanh_body<V: Vector>(x: &mut [f32], bias: &[f32]) {
+    for row in x.chunks_exact_mut(bias.len()) {
+        for (x, bias) in row.iter_mut().zip(bias) {
+            *x = tanh_body(*x + bias, V::scalar);
+        }
+    }
+}
+
+vectorise! {
+    /// The way back of [`bias_tanh`]: turns the gradient of its output `y` into that of its input, and adds its rows up in `of_bias`.
+    pub fn bias_tanh_backward(gradient: &mut [f32], y: &[f32], of_bias: &mut [f32]) = bias_tanh_backward_body
+}
+
+#[inline(always)]
+fn bias_tanh_backward_body<V: Vector>(gradient: &mut [f32], y: &[f32], of_bias: &mut [f32]) {
     let columns = of_bias.len();
     for (gradient, y) in gradient.chunks_exact_mut(columns).zip(y.chunks_exact(columns)) {
         for ((g, y), b) in gradient.iter_mut().zip(y).zip(of_bias.iter_mut()) {
@@ -196,20 +289,72 @@ mod tests {
 
     #[test]
     fn dense_multiplies_and_does_not_depend_on_the_number_of_rows() {
-        let (rows, inputs) = (7, 5);
+        let (rows, inputs) = (15, 5);
         let x: Vec<f32> = (0..rows * inputs).map(|i| (i as f32 * 0.7).sin()).collect();
         let w: Vec<f32> = (0..inputs * 32).map(|i| (i as f32 * 0.3).cos()).collect();
         let bias: Vec<f32> = (0..32).map(|i| i as f32).collect();
         let mut y = vec![0.0; rows * 32];
-        dense::<32>(&x, inputs, &w, Some(&bias), &mut y);
+        dense(&x, inputs, &w, Start::Bias(&bias), &mut y);
         for r in 0..rows {
             for c in 0..32 {
                 let expected: f32 = bias[c] + (0..inputs).map(|k| x[r * inputs + k] * w[k * 32 + c]).sum::<f32>();
                 assert!((y[r * 32 + c] - expected).abs() < 1e-5);
             }
             let mut one = vec![0.0; 32];
-            dense::<32>(&x[r * inputs..(r + 1) * inputs], inputs, &w, Some(&bias), &mut one);
+            dense(&x[r * inputs..(r + 1) * inputs], inputs, &w, Start::Bias(&bias), &mut one);
             assert_eq!(one, y[r * 32..(r + 1) * 32]);
         }
+    }
+
+    #[test]
+    fn gradients_of_weights_are_sums_over_the_rows() {
+        let (rows, inputs, outputs) = (11, 13, 64);
+        let x: Vec<f32> = (0..rows * inputs).map(|i| (i as f32 * 0.7).sin()).collect();
+        let of_y: Vec<f32> = (0..rows * outputs).map(|i| (i as f32 * 0.3).cos()).collect();
+        let mut of_w = vec![1.0; inputs * outputs];
+        dense_weights(&x, inputs, &of_y, &mut of_w);
+        for i in 0..inputs {
+            for o in 0..outputs {
+                let sum: f32 = (0..rows).map(|r| x[r * inputs + i] * of_y[r * outputs + o]).sum();
+                assert!((of_w[i * outputs + o] - 1.0 - sum).abs() < 1e-5);
+            }
+        }
+    }
+
+    #[test]
+    #[cfg(target_arch = "x86_64")]
+    fn both_register_widths_give_the_same_bits() {
+        use std::arch::x86_64::{__m256, __m512};
+        if !(std::arch::is_x86_feature_detected!("avx512f") && std::arch::is_x86_feature_detected!("fma")) {
+            return;
+        }
+        #[target_feature(enable = "avx512f,avx2,fma")]
+        fn wide(p: Product, c: &mut [f32]) {
+            product_body::<__m512>(p, c);
+        }
+        #[target_feature(enable = "avx2,fma")]
+        fn narrow(p: Product, c: &mut [f32]) {
+            product_body::<__m256>(p, c);
+        }
+        let a: Vec<f32> = (0..13 * 40).map(|i| (i as f32 * 0.7).sin()).collect();
+        let b: Vec<f32> = (0..40 * 64).map(|i| (i as f32 * 0.3).cos()).collect();
+        let p = Product {
+            a: &a,
+            a_row: 40,
+            a_step: 1,
+            b: &b,
+            steps: 40,
+            start: &ZERO[..64],
+            start_stride: 0,
+            rows: 13,
+            columns: 64,
+        };
+        let [mut one, mut other] = [vec![0.0; 13 * 64], vec![0.0; 13 * 64]];
+        // SAFETY: the processor has both.
+        unsafe {
+            wide(p, &mut one);
+            narrow(p, &mut other);
+        }
+        assert_eq!(one, other);
     }
 }

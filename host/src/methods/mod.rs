@@ -1,20 +1,26 @@
 //! The learning methods: one policy shared by all modules, trained with PPO against a critic that sees the whole team.
 //!
 //! What is shared by all methods lives here: flat parameters with named blocks, orthogonal initialisation, Adam, and the rule by
-//! which every random stream is derived from the seed of the run.
+//! which every random stream is derived from the seed of the run, and the threads that share the work.
 
+pub mod actor;
 pub mod actor_critic;
+pub mod autodiff;
 pub mod buffer;
+pub mod critic;
 pub mod fused;
 pub mod imagination;
-pub mod inference;
 pub(crate) mod kernels;
 pub mod normalise;
 pub mod ppo;
 pub mod rollout;
+pub(crate) mod simd;
+
+use std::sync::{Arc, Mutex};
 
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use rayon::iter::{IntoParallelRefMutIterator, ParallelIterator};
 use serde::{Deserialize, Serialize};
 
 /// How a policy is built and trained.
@@ -76,6 +82,72 @@ impl std::str::FromStr for Method {
             let names: Vec<_> = Self::ALL.iter().map(|method| method.name()).collect();
             format!("there is no method `{name}`; the methods are {}", names.join(", "))
         })
+    }
+}
+
+/// Which code computes the gradients.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Differentiation {
+    /// The backward passes written by hand for these two networks ([`actor`], [`critic`]).
+    #[default]
+    Manual,
+    /// burn's automatic differentiation ([`autodiff`]): several times slower, the same up to rounding. The reference for the former and
+    /// where to begin with a network of another kind.
+    Automatic,
+}
+
+/// The threads of a run. They live as long as this and its clones do.
+#[derive(Clone, Debug)]
+pub struct Workers {
+    pool: Arc<rayon::ThreadPool>,
+}
+
+impl Workers {
+    /// Starts so many threads.
+    ///
+    /// # Errors
+    ///
+    /// If the system does not give them.
+    pub fn new(threads: usize) -> anyhow::Result<Self> {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.max(1)).build()?;
+        Ok(Self { pool: Arc::new(pool) })
+    }
+
+    /// How many there are.
+    pub fn threads(&self) -> usize {
+        self.pool.current_num_threads()
+    }
+
+    /// Runs `work` on one of the threads: what it asks the workers for in turn then starts without a switch of threads.
+    pub fn enter<R: Send>(&self, work: impl FnOnce() -> R + Send) -> R {
+        self.pool.install(work)
+    }
+
+    /// Applies `task` to every item; whoever is free takes the next. Each thread has an entry of `scratch` for itself meanwhile, so there
+    /// should be as many as threads.
+    pub fn for_each<I, S>(&self, items: I, scratch: &mut [S], task: impl Fn(I::Item, &mut S) + Sync)
+    where
+        I: IntoIterator,
+        I::IntoIter: Send,
+        S: Send,
+    {
+        let items = Mutex::new(items.into_iter());
+        self.pool.install(|| {
+            scratch.par_iter_mut().for_each(|scratch| {
+                loop {
+                    // The lock is held only to take the next item.
+                    let next = items.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).next();
+                    let Some(item) = next else { return };
+                    task(item, scratch);
+                }
+            });
+        });
+    }
+
+    /// Runs both, side by side if two threads are free.
+    pub fn join<A: Send, B: Send>(&self, a: impl FnOnce() -> A + Send, b: impl FnOnce() -> B + Send) -> (A, B) {
+        self.pool.join(a, b)
     }
 }
 

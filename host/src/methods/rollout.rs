@@ -2,18 +2,17 @@
 //!
 //! No environment waits for another, and nothing an environment does depends on which thread runs it or when.
 
-use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 use composer_shared::observation::{Observation, SIZE};
 use rand_chacha::ChaCha8Rng;
 
+use super::actor::{Actor, ActorScratch};
 use super::actor_critic::{OUT, log_probability};
 use super::buffer::{Experience, Lane, Track};
 use super::imagination::{DISPLACEMENT, Imagination, follow_error};
-use super::inference::{Inference, Scratch};
 use super::normalise::Running;
-use super::{Stream, derive_seed, normal_pair, stream};
+use super::{Stream, Workers, derive_seed, normal_pair, stream};
 use crate::environment::{Environment, PRIVILEGED, View};
 
 /// Normalised numbers are clipped to this.
@@ -99,7 +98,7 @@ impl<const N: usize> Frozen<N> {
 #[derive(Clone, Copy)]
 pub struct Iteration<'a> {
     /// The control policy's actor.
-    pub policy: &'a Inference<OUT>,
+    pub policy: &'a Actor,
     /// The imagination policy, if the method has one.
     pub imagination: Option<Imagination<'a>>,
     /// Statistics of the observations.
@@ -128,70 +127,52 @@ pub fn collect(
     slots: &mut [Slot],
     experience: &mut Experience,
     iteration: Iteration,
-    threads: usize,
+    workers: &Workers,
     observations: &mut Running,
     privileged: &mut Running,
 ) -> Split {
-    let split = {
-        let Experience { lanes, control, imagination } = experience;
-        let tracks = control.iter_mut().zip(imagination);
-        let work = Mutex::new(slots.iter_mut().zip(lanes).zip(tracks));
-        let worker = || {
-            let mut split = Split::default();
-            let mut scratch = Scratch::default();
-            loop {
-                // The lock is held only to take the next environment; no panic can happen inside.
-                let next = work.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).next();
-                let Some(((slot, lane), (control, imagination))) = next else { return split };
-                let began = Instant::now();
-                let physics = run(slot, lane, control, imagination, &iteration, &mut scratch);
-                split.physics += physics;
-                split.inference += began.elapsed().saturating_sub(physics);
-            }
-        };
-        std::thread::scope(|scope| {
-            let others: Vec<_> = (1..threads.max(1)).map(|_| scope.spawn(worker)).collect();
-            let mut total = worker();
-            for other in others {
-                match other.join() {
-                    Ok(split) => {
-                        total.physics += split.physics;
-                        total.inference += split.inference;
-                    }
-                    Err(panic) => std::panic::resume_unwind(panic),
-                }
-            }
-            total
-        })
-    };
+    let mut scratch = vec![(ActorScratch::default(), Split::default()); workers.threads()];
+    let Experience { lanes, control, imagination } = experience;
+    let items = slots.iter_mut().zip(lanes).zip(control.iter_mut().zip(imagination));
+    workers.for_each(items, &mut scratch, |((slot, lane), (control, imagination)), (scratch, split)| {
+        let began = Instant::now();
+        let physics = run(slot, lane, control, imagination, &iteration, scratch);
+        split.physics += physics;
+        split.inference += began.elapsed().saturating_sub(physics);
+    });
     // In the order of the environments, so that rounding does not depend on the threads.
     for slot in slots {
         observations.merge(&std::mem::replace(&mut slot.observations, Running::new(SIZE)));
         privileged.merge(&std::mem::replace(&mut slot.privileged, Running::new(PRIVILEGED)));
     }
-    split
+    let mut total = Split::default();
+    for (_, split) in scratch {
+        total.physics += split.physics;
+        total.inference += split.inference;
+    }
+    total
 }
 
 /// One policy in the rollout of one environment.
 struct Player<'a, const A: usize> {
-    policy: &'a Inference<A>,
+    policy: &'a Actor,
     track: &'a mut Track<A>,
     rng: ChaCha8Rng,
-    means: Vec<[f32; A]>,
+    log_sigma: [f32; A],
     sigma: [f32; A],
 }
 
 impl<'a, const A: usize> Player<'a, A> {
-    fn new(policy: &'a Inference<A>, track: &'a mut Track<A>, rng: ChaCha8Rng, modules: usize) -> Self {
-        Self { policy, track, rng, means: vec![[0.0; A]; modules], sigma: policy.log_sigma.map(f32::exp) }
+    fn new(policy: &'a Actor, track: &'a mut Track<A>, rng: ChaCha8Rng) -> Self {
+        let log_sigma = std::array::from_fn(|i| policy.log_sigma()[i]);
+        Self { policy, track, rng, log_sigma, sigma: log_sigma.map(f32::exp) }
     }
 
     /// Draws an action for each module from what it observes and hears, and returns them all.
-    fn act(&mut self, observations: &[f32], heard: &[u64], scratch: &mut Scratch) -> &[[f32; A]] {
-        let log_sigma = self.policy.log_sigma;
+    fn act(&mut self, observations: &[f32], heard: &[u64], scratch: &mut ActorScratch) -> &[[f32; A]] {
         let first = self.track.actions.len();
-        self.policy.means(observations, heard, &mut self.means, scratch);
-        for mean in &self.means {
+        let means = self.policy.means(observations, heard, &[heard.len()], scratch);
+        for mean in means.as_chunks::<A>().0 {
             // Numbers come in pairs; the last is thrown away if there is an odd number of actions.
             let mut pair = [0.0; 2];
             let action = std::array::from_fn(|i| {
@@ -201,7 +182,7 @@ impl<'a, const A: usize> Player<'a, A> {
                 mean[i] + self.sigma[i] * pair[i % 2]
             });
             self.track.actions.push(action);
-            self.track.log_probabilities.push(log_probability(action, *mean, log_sigma));
+            self.track.log_probabilities.push(log_probability(action, *mean, self.log_sigma));
         }
         &self.track.actions[first..]
     }
@@ -214,7 +195,7 @@ fn run(
     control: &mut Track<OUT>,
     imagination: &mut Track<DISPLACEMENT>,
     iteration: &Iteration,
-    scratch: &mut Scratch,
+    scratch: &mut ActorScratch,
 ) -> Duration {
     let n = slot.modules;
     let mut physics = Duration::ZERO;
@@ -223,10 +204,10 @@ fn run(
     lane.clear(n);
     control.clear();
     imagination.clear();
-    let mut control = Player::new(iteration.policy, control, noise(iteration.run_seed), n);
+    let mut control = Player::new(iteration.policy, control, noise(iteration.run_seed));
     let mut imagination = iteration
         .imagination
-        .map(|settings| (settings, Player::new(settings.policy, imagination, noise(settings.seed), n)));
+        .map(|settings| (settings, Player::new(settings.policy, imagination, noise(settings.seed))));
     let mut imagined = Vec::with_capacity(n);
     for step in 0..iteration.steps {
         let first = lane.observations.len();

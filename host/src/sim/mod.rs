@@ -1,34 +1,36 @@
-//! The snake in rapier.
+//! The snake and its scene, simulated.
 //!
-//! A chain of capsules joined by hinges (impulse joints). A joint's spring, its motor and the motor's torque-speed line are one
-//! implicit spring-damper: the torque command `tau` moves the spring's target to `tau / k`, so that the joint feels
-//! `tau - k q - c w`, and `c = tau_max / no-load speed` is the slope of the torque-speed line. Implicit, because at these
-//! stiffnesses an explicit torque would need a tenth of the step.
+//! A chain of capsules joined by hinges. Each joint feels `tau - k q - c w`: the motor's torque, a spring that pulls it straight, and the
+//! slope `c = tau_max / no-load speed` of the motor's torque-speed line. Whatever a link touches rubs on it dry and anisotropically
+//! ([`contact`]). All of it is implicit.
 //!
-//! Ground and walls are frictionless for rapier; the snake's friction on them is an explicit anisotropic Coulomb force in the plane of
-//! each contact, with the contact's own load, normal and point (`Snake::apply_friction`). A block that can be pushed has rapier's
-//! own isotropic friction, on the ground and on the body.
+//! | part | whose | why |
+//! |---|---|---|
+//! | velocities of chain and block ([`chain`]) | ours | rapier's iterations do not converge a chain of 32 links at an affordable number |
+//! | law of contact and friction ([`contact`]) | ours | rapier has one coefficient of friction a contact, none along and across |
+//! | collision of capsules, ground and boxes ([`collide`]) | ours, analytic; rapier's is the test's oracle | four times faster than the general pipeline |
+//! | shapes, joints, solver of the second opinion (`rapier`) | rapier | a simulator that nobody here wrote, in the same process |
 //!
 //! World frame: x and y horizontal, z up; the snake lies along x with its head towards +x.
 
 use composer_shared::observation::Sensors;
 use composer_shared::robot::{self, AXES, Geometry, MAX_JOINTS};
-use rapier3d::dynamics::JointAxesMask;
-use rapier3d::prelude::*;
+use composer_sim_bridge::sensor_model::{Mean, ModuleSensorState, PERIOD, SensorModel, Truth};
+use rapier3d::math::{Pose, Rotation, Vector};
 
-use crate::robot::Robot;
+use crate::robot::{Robot, Solver};
 
+pub mod chain;
+pub mod collide;
+pub mod contact;
+mod rapier;
 pub mod scene;
 
+pub use chain::Effort;
 pub use scene::Scene;
 
-/// Below this sliding speed (units/s) friction fades out linearly instead of flipping its sign.
-const STILL_SPEED: f32 = 0.01;
-/// Faster than the no-load speed the drive brakes with this many times its normal damping.
-const OVERSPEED_BRAKE: f32 = 8.0;
-
-/// Collision group of everything besides the snake.
-const SCENE: InteractionGroups = InteractionGroups::new(Group::GROUP_32, Group::ALL, InteractionTestMode::And);
+/// Temperature of the motors, which is not simulated, degrees Celsius.
+const AMBIENT: f32 = 25.0;
 
 /// Extremes of the motion, for the sanity of what was learnt.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -41,44 +43,80 @@ pub struct Motion {
     pub peak_joint_speed: f32,
 }
 
-/// A loaded contact of the snake.
-struct Contact {
-    /// The links on both sides; none is the ground or a solid.
-    links: [Option<usize>; 2],
-    /// Where, in the world.
-    point: Vector,
-    /// Its normal, of length 1.
-    normal: Vector,
-    /// Normal force.
-    load: f32,
+/// Where a rigid body is and how it moves.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LinkState {
+    /// Centre of mass, world, units.
+    pub position: [f32; 3],
+    /// Rotation, quaternion x, y, z, w.
+    pub rotation: [f32; 4],
+    /// Velocity of the centre of mass, world, units/s.
+    pub linear: [f32; 3],
+    /// Angular velocity, world, rad/s.
+    pub angular: [f32; 3],
+}
+
+impl LinkState {
+    const REST: LinkState =
+        LinkState { position: [0.0; 3], rotation: [0.0, 0.0, 0.0, 1.0], linear: [0.0; 3], angular: [0.0; 3] };
+
+    fn turn(&self) -> Rotation {
+        Rotation::from_array(self.rotation)
+    }
+
+    fn pose(&self) -> Pose {
+        Pose::from_parts(Vector::from(self.position), self.turn())
+    }
+
+    fn seen(&self, vector: [f32; 3]) -> [f32; 3] {
+        (self.turn().inverse() * Vector::from(vector)).to_array()
+    }
+}
+
+/// Everything that moves.
+#[derive(Clone, Debug, PartialEq)]
+pub struct State {
+    /// Links, from the head on.
+    pub links: Vec<LinkState>,
+    /// Angle of each joint, head first, rad; even joints yaw, odd joints pitch.
+    pub joint_angles: Vec<f32>,
+    /// Speed of each joint, rad/s.
+    pub joint_speeds: Vec<f32>,
+    /// The block, if there is one.
+    pub block: Option<LinkState>,
+}
+
+/// What moves the snake.
+enum Engine {
+    Direct(Box<chain::Chain>),
+    Rapier(Box<rapier::RapierSnake>),
+    /// Something else, elsewhere, that says where it is ([`Snake::follow`]).
+    Mirror,
+}
+
+/// The sensors of one module, and what they felt since their last sample.
+struct Suite {
+    sensors: ModuleSensorState,
+    mean: Mean,
+    /// Velocity of the own link after the last physics step.
+    velocity: Vector,
 }
 
 /// The snake and its scene.
 pub struct Snake {
     robot: Robot,
-    world: PhysicsWorld,
-    links: Vec<RigidBodyHandle>,
-    block: Option<RigidBodyHandle>,
-    joints: Vec<ImpulseJointHandle>,
+    engine: Engine,
+    state: State,
     /// Torque on each axis of each module now, and where it is heading.
     torque: Vec<[f32; AXES]>,
     command: Vec<[f32; AXES]>,
     motion: Motion,
-    contacts: Vec<Contact>,
-    /// Sum of the loads of a link's contacts.
-    loads: Vec<f32>,
-}
-
-/// Collision groups: one bit for the scene, 31 that the modules share in turn. A link meets the scene and the links of
-/// modules that are not its neighbours (the capsules of neighbours overlap by construction).
-fn groups(module: usize) -> InteractionGroups {
-    let bit = |m: usize| 1u32 << (m % 31);
-    let near = bit(module) | bit(module + 1) | bit(module + 30);
-    InteractionGroups::new(
-        Group::from_bits_retain(bit(module)),
-        Group::from_bits_retain(!near),
-        InteractionTestMode::And,
-    )
+    block_mass: f32,
+    block_moments: [f32; 3],
+    /// Sensors as their datasheets have them; without, a module senses the truth.
+    suites: Vec<Suite>,
+    /// Physics steps since the sensors were fitted.
+    steps: usize,
 }
 
 impl Snake {
@@ -89,70 +127,94 @@ impl Snake {
 
     /// The same with something else on the ground.
     pub fn in_scene(robot: &Robot, scene: &Scene) -> Self {
-        let mut world = PhysicsWorld { gravity: Vector::new(0.0, 0.0, -robot.gravity), ..PhysicsWorld::default() };
-        let parameters = &mut world.integration_parameters;
-        parameters.dt = robot.physics_step;
-        parameters.num_solver_iterations = robot.solver_iterations;
-        parameters.num_internal_stabilization_iterations = 0;
-        parameters.max_ccd_substeps = 0;
-        // The joints start each step from nothing. Contacts that start from their last impulses in full push harder than the chain
-        // holds, and a link held from two sides shakes itself to pieces; contacts that start from nothing let a block creep.
-        parameters.warmstart_coefficient = 0.7;
-        parameters.contact_clustering = false;
-        world.colliders.insert(
-            ColliderBuilder::halfspace(rapier3d::na::Unit::new_unchecked(Vector::Z))
-                .friction(0.0)
-                .collision_groups(SCENE)
-                .build(),
-        );
-        let block = scene.build(&mut world);
-        let (length, radius) = (robot.link_length, robot.link_radius);
-        let mut links = Vec::with_capacity(robot.links());
-        let mut joints = Vec::with_capacity(robot.links() - 1);
-        for link in 0..robot.links() {
-            let module = link / robot.links_per_module;
-            let body = RigidBodyBuilder::dynamic()
-                .translation(Vector::new(-(link as f32) * length, 0.0, radius))
-                .can_sleep(false)
-                .additional_mass_properties(MassProperties::new(
-                    Vector::ZERO,
-                    robot.link_mass,
-                    Vector::splat(robot.link_inertia),
-                ));
-            let handle = world.bodies.insert(body);
-            let collider = ColliderBuilder::capsule_x(0.5 * length, radius)
-                .density(0.0)
-                .friction(0.0)
-                .collision_groups(groups(module))
-                .user_data(link as u128);
-            world.colliders.insert_with_parent(collider, handle, &mut world.bodies);
-            if let Some(&front) = links.last() {
-                let joint_in_module = (link - 1) % robot.links_per_module;
-                let axis = if joint_in_module.is_multiple_of(2) { Vector::Z } else { Vector::Y };
-                let joint = GenericJointBuilder::new(JointAxesMask::LOCKED_REVOLUTE_AXES)
-                    .local_axis1(axis)
-                    .local_axis2(axis)
-                    .local_anchor1(Vector::new(-0.5 * length, 0.0, 0.0))
-                    .local_anchor2(Vector::new(0.5 * length, 0.0, 0.0))
-                    .motor_model(JointAxis::AngX, MotorModel::ForceBased)
-                    .set_motor(JointAxis::AngX, 0.0, 0.0, robot.stiffness, robot.joint_damping())
-                    .contacts_enabled(false)
-                    .build();
-                joints.push(world.impulse_joints.insert(front, handle, joint, true));
-            }
-            links.push(handle);
-        }
-        Snake {
+        let engine = match robot.solver {
+            Solver::Direct => Engine::Direct(Box::new(chain::Chain::new(robot, scene))),
+            Solver::Rapier => Engine::Rapier(Box::new(rapier::RapierSnake::new(robot, scene))),
+        };
+        Self::with_engine(robot, scene, engine)
+    }
+
+    /// A snake that something else moves: it only shows what [`Snake::follow`] tells.
+    pub fn mirror(robot: &Robot, scene: &Scene) -> Self {
+        Self::with_engine(robot, scene, Engine::Mirror)
+    }
+
+    fn with_engine(robot: &Robot, scene: &Scene, engine: Engine) -> Self {
+        let links = robot.links();
+        let place = |link: usize| LinkState {
+            position: [-(link as f32) * robot.link_length, 0.0, robot.link_radius],
+            ..LinkState::REST
+        };
+        let block = scene.block.map(|block| {
+            let (sin, cos) = libm::sincosf(0.5 * block.yaw);
+            LinkState { position: block.position, rotation: [0.0, 0.0, sin, cos], ..LinkState::REST }
+        });
+        let mut snake = Snake {
             robot: robot.clone(),
-            world,
-            links,
-            block,
-            joints,
+            engine,
+            state: State {
+                links: (0..links).map(place).collect(),
+                joint_angles: vec![0.0; links - 1],
+                joint_speeds: vec![0.0; links - 1],
+                block,
+            },
             torque: vec![[0.0; AXES]; robot.modules],
             command: vec![[0.0; AXES]; robot.modules],
             motion: Motion::default(),
-            contacts: Vec::new(),
-            loads: vec![0.0; robot.links()],
+            block_mass: scene.block.map_or(0.0, |b| b.mass),
+            block_moments: scene.block.map_or([0.0; 3], |b| b.moments()),
+            suites: Vec::new(),
+            steps: 0,
+        };
+        snake.read();
+        snake
+    }
+
+    /// Fits every module with sensors that have noise, offsets and filters, drawn with `seed`, after a rest where the snake is now.
+    pub fn fit_sensors(&mut self, model: &SensorModel, seed: u64) {
+        self.steps = 0;
+        self.suites = (0..self.robot.modules)
+            .map(|module| {
+                let mut sensors = ModuleSensorState::new(model, crate::methods::mix(seed ^ (module as u64) << 32));
+                let force = self.own_link(module).seen([0.0, 0.0, 1.0]);
+                sensors.rest(&self.truth(module, force, [0.0; 3]));
+                Suite { sensors, mean: Mean::default(), velocity: Vector::ZERO }
+            })
+            .collect();
+    }
+
+    /// What there is to sense of a module: its joints now, and the specific force (g) and angular rate (rad/s) it felt.
+    fn truth(&self, module: usize, specific_force: [f32; 3], angular_rate: [f32; 3]) -> Truth {
+        let links = self.robot.links_per_module;
+        let mut truth = Truth { specific_force, angular_rate, ..Truth::default() };
+        for k in 0..links.min(MAX_JOINTS) {
+            let index = module * links + k;
+            if index < self.state.joint_angles.len() {
+                truth.joint_angles[k] = self.state.joint_angles[index];
+                truth.joint_speeds[k] = self.state.joint_speeds[index];
+                truth.joints = k + 1;
+            }
+        }
+        truth
+    }
+
+    /// Lets the sensors feel the last physics step, and sample when it is time.
+    fn sense(&mut self) {
+        let (dt, gravity) = (self.robot.physics_step, self.robot.gravity);
+        self.steps += 1;
+        let sample = self.steps.is_multiple_of((PERIOD / dt).round().max(1.0) as usize);
+        for module in 0..self.suites.len() {
+            let own = *self.own_link(module);
+            let suite = &mut self.suites[module];
+            let velocity = Vector::from(own.linear);
+            let force = ((velocity - suite.velocity) / dt + gravity * Vector::Z) / gravity;
+            suite.velocity = velocity;
+            suite.mean.add(own.seen(force.to_array()), own.seen(own.angular), dt);
+            if sample {
+                let (force, rate) = suite.mean.take();
+                let truth = self.truth(module, force, rate);
+                self.suites[module].sensors.update(&truth);
+            }
         }
     }
 
@@ -176,245 +238,197 @@ impl Snake {
         self.torque[module]
     }
 
-    /// Advances by one physics step.
-    pub fn step(&mut self) {
+    /// Lets the motors slew for one physics step, and returns the torques that act in it: yaw and pitch of each module.
+    pub fn slew(&mut self) -> &[[f32; AXES]] {
         let step = self.robot.torque_slew * self.robot.physics_step;
         for (torque, command) in self.torque.iter_mut().zip(&self.command) {
             for axis in 0..AXES {
                 torque[axis] = robot::slew(torque[axis], command[axis], step);
             }
         }
-        let damping = self.robot.joint_damping();
-        for index in 0..self.joints.len() {
-            let speed = self.joint_speed(index).abs();
-            self.motion.peak_joint_speed = self.motion.peak_joint_speed.max(speed);
-            let (module, k) = (index / self.robot.links_per_module, index % self.robot.links_per_module);
-            let target = self.torque[module][k % 2] / self.robot.stiffness;
-            let over = (speed / self.robot.joint_speed_limit - 1.0).clamp(0.0, 1.0);
-            if let Some(joint) = self.world.impulse_joints.get_mut(self.joints[index], false) {
-                let motor = &mut joint.data.motors[JointAxis::AngX as usize];
-                motor.target_pos = target;
-                motor.damping = damping * (1.0 + OVERSPEED_BRAKE * over);
-            }
+        &self.torque
+    }
+
+    /// Advances by one physics step.
+    pub fn step(&mut self) {
+        self.slew();
+        match &mut self.engine {
+            Engine::Direct(chain) => chain.step(&self.robot, &self.torque),
+            Engine::Rapier(world) => world.step(&self.robot, &self.torque, &self.state.joint_speeds),
+            Engine::Mirror => {}
         }
-        self.apply_friction();
-        self.world.step();
-        for &link in &self.links {
-            let body = &self.world.bodies[link];
-            self.motion.peak_link_speed = self.motion.peak_link_speed.max(body.linvel().length());
-            self.motion.peak_height = self.motion.peak_height.max(body.translation().z);
+        self.read();
+        self.watch();
+    }
+
+    /// Takes over where everything is, for a snake that something else moves.
+    pub fn follow(&mut self, state: &State) {
+        self.state.clone_from(state);
+        self.watch();
+    }
+
+    fn read(&mut self) {
+        match &self.engine {
+            Engine::Direct(chain) => chain.write(&mut self.state),
+            Engine::Rapier(world) => world.write(&self.robot, &mut self.state),
+            Engine::Mirror => {}
         }
     }
 
-    /// Anisotropic Coulomb friction from the contacts of the last step: in the plane of each contact, opposed to the sliding of
-    /// the link's contact point, with one coefficient along the link and another across it. All contacts of a link together can at
-    /// most stop it within the step, so that friction never drives.
-    fn apply_friction(&mut self) {
-        for &link in &self.links {
-            let body = &mut self.world.bodies[link];
-            body.reset_forces(false);
-            body.reset_torques(false);
+    fn watch(&mut self) {
+        let motion = &mut self.motion;
+        for link in &self.state.links {
+            motion.peak_link_speed = motion.peak_link_speed.max(Vector::from(link.linear).length());
+            motion.peak_height = motion.peak_height.max(link.position[2]);
         }
-        self.find_contacts();
-        let (along, across) = (self.robot.friction_along, self.robot.friction_across);
-        let per_load = across * self.robot.physics_step / self.robot.link_mass;
-        for contact in &self.contacts {
-            let [one, two] = contact.links.map(|link| link.map(|l| self.links[l]));
-            let velocity = |body: Option<RigidBodyHandle>| {
-                body.map_or(Vector::ZERO, |b| self.world.bodies[b].velocity_at_point(contact.point))
-            };
-            let Some(link) = two.or(one) else { continue };
-            let normal = contact.normal;
-            let sliding = velocity(two) - velocity(one);
-            let sliding = sliding - normal * sliding.dot(normal);
-            let axis = self.world.bodies[link].rotation() * Vector::X;
-            let axial = (axis - normal * axis.dot(normal)).normalize_or_zero();
-            let v_along = axial * sliding.dot(axial);
-            let v_across = sliding - v_along;
-            let speed = sliding.length();
-            // The change of the sliding speed in a step if every contact of the links had its full friction.
-            let stopping: f32 = contact.links.iter().flatten().map(|l| self.loads[*l] * per_load).sum();
-            let scale = contact.load / speed.max(STILL_SPEED).max(stopping);
-            let force = -(v_along * along + v_across * across) * scale;
-            if let Some(two) = two {
-                self.world.bodies[two].add_force_at_point(force, contact.point, false);
-            }
-            if let Some(one) = one {
-                self.world.bodies[one].add_force_at_point(-force, contact.point, false);
-            }
+        for speed in &self.state.joint_speeds {
+            motion.peak_joint_speed = motion.peak_joint_speed.max(speed.abs());
+        }
+        if !self.suites.is_empty() {
+            self.sense();
         }
     }
 
-    /// The snake's loaded contacts of the last step with ground, solids and itself, and the load on each link. Those with the block
-    /// have rapier's friction.
-    fn find_contacts(&mut self) {
-        let dt = self.robot.physics_step;
-        self.contacts.clear();
-        self.loads.fill(0.0);
-        for pair in self.world.narrow_phase.contact_pairs() {
-            let colliders = [pair.collider1, pair.collider2].map(|handle| &self.world.colliders[handle]);
-            let parents = colliders.map(Collider::parent);
-            if self.block.is_some() && parents.contains(&self.block) {
-                continue;
-            }
-            let links = [0, 1].map(|side| parents[side].map(|_| colliders[side].user_data as usize));
-            for manifold in pair.solver_manifolds() {
-                let load: f32 = manifold.points.iter().map(|p| p.data.impulse).sum::<f32>() / dt;
-                if load <= 0.0 {
-                    continue;
-                }
-                // The frame of the first collider carries the contact point; impulses weigh the points of a line contact.
-                let weighted: Vector = manifold.points.iter().map(|p| p.local_p1 * p.data.impulse).sum();
-                let point = colliders[0].position().transform_point(weighted / (load * dt));
-                links.iter().flatten().for_each(|link| self.loads[*link] += load);
-                self.contacts.push(Contact { links, point, normal: manifold.data.normal, load });
-            }
+    /// Where everything is, and how it moves.
+    pub fn state(&self) -> &State {
+        &self.state
+    }
+
+    /// What the direct solver did so far; nothing of another.
+    pub fn effort(&self) -> Effort {
+        match &self.engine {
+            Engine::Direct(chain) => chain.effort(),
+            _ => Effort::default(),
+        }
+    }
+
+    /// How deep the deepest contact of the snake is now, units; the direct solver alone knows.
+    pub fn penetration(&mut self) -> f32 {
+        match &mut self.engine {
+            Engine::Direct(chain) => chain.penetration(&self.robot),
+            _ => 0.0,
         }
     }
 
     /// Position and rotation (quaternion x, y, z, w) of the block, if there is one.
     pub fn block(&self) -> Option<([f32; 3], [f32; 4])> {
-        self.block.map(|handle| {
-            let body = &self.world.bodies[handle];
-            let r = body.rotation();
-            (body.translation().to_array(), [r.x, r.y, r.z, r.w])
-        })
+        self.state.block.map(|block| (block.position, block.rotation))
     }
 
     /// Where a module is: the centre of its own link, units.
     pub fn module_position(&self, module: usize) -> [f32; 3] {
-        self.own_link(module).translation().to_array()
+        self.own_link(module).position
     }
 
     /// Rotation of a module's own frame, quaternion x, y, z, w.
     pub fn module_rotation(&self, module: usize) -> [f32; 4] {
-        let r = self.own_link(module).rotation();
-        [r.x, r.y, r.z, r.w]
+        self.own_link(module).rotation
     }
 
     /// Centre of the last link in the world.
     pub fn tail(&self) -> [f32; 3] {
-        self.world.bodies[self.links[self.links.len() - 1]].translation().to_array()
+        self.state.links[self.state.links.len() - 1].position
     }
 
-    fn joint_speed(&self, index: usize) -> f32 {
-        let (front, rear) = (&self.world.bodies[self.links[index]], &self.world.bodies[self.links[index + 1]]);
-        let axis = if (index % self.robot.links_per_module).is_multiple_of(2) { Vector::Z } else { Vector::Y };
-        (rear.angvel() - front.angvel()).dot(front.rotation() * axis)
-    }
-
-    fn joint_angle(&self, index: usize) -> f32 {
-        let (front, rear) = (&self.world.bodies[self.links[index]], &self.world.bodies[self.links[index + 1]]);
-        let relative = front.rotation().inverse() * *rear.rotation();
-        let axial = if (index % self.robot.links_per_module).is_multiple_of(2) { relative.z } else { relative.y };
-        let angle = 2.0 * libm::atan2f(axial, relative.w);
-        // q and -q are the same rotation.
-        if angle > std::f32::consts::PI {
-            angle - std::f32::consts::TAU
-        } else if angle < -std::f32::consts::PI {
-            angle + std::f32::consts::TAU
-        } else {
-            angle
-        }
-    }
-
-    /// One sample of a module's sensors.
+    /// What a module's sensors say: their last sample, or the truth if none were fitted.
     pub fn sensors(&self, module: usize) -> Sensors {
-        let links = self.robot.links_per_module;
-        let mut sensors = Sensors { temperature: 25.0, ..Sensors::ZERO };
-        for k in 0..links.min(MAX_JOINTS) {
-            let index = module * links + k;
-            if index < self.joints.len() {
-                sensors.joint_angles[k] = self.joint_angle(index);
-                sensors.joint_speeds[k] = self.joint_speed(index);
-            }
+        let torque = self.torque[module].map(|t| t / self.robot.torque_limit);
+        if let Some(suite) = self.suites.get(module) {
+            return suite.sensors.sensors(torque, AMBIENT);
         }
-        let body = self.own_link(module);
-        let to_own = body.rotation().inverse();
-        sensors.up = (to_own * Vector::Z).to_array();
-        sensors.angular_rate = (to_own * body.angvel()).to_array();
-        sensors.torque = self.torque[module].map(|t| t / self.robot.torque_limit);
-        sensors
+        let own = self.own_link(module);
+        let truth = self.truth(module, [0.0; 3], [0.0; 3]);
+        Sensors {
+            joint_angles: truth.joint_angles,
+            joint_speeds: truth.joint_speeds,
+            up: own.seen([0.0, 0.0, 1.0]),
+            angular_rate: own.seen(own.angular),
+            torque,
+            temperature: AMBIENT,
+        }
     }
 
-    fn own_link(&self, module: usize) -> &RigidBody {
+    fn own_link(&self, module: usize) -> &LinkState {
         let own = Geometry::OWN_LINK.min(self.robot.links_per_module - 1);
-        &self.world.bodies[self.links[module * self.robot.links_per_module + own]]
+        &self.state.links[module * self.robot.links_per_module + own]
     }
 
     /// What no real module could measure, for the critic of the training alone: linear velocity in the own frame (units/s) and height of the own link.
     pub fn privileged(&self, module: usize) -> ([f32; 3], f32) {
-        let body = self.own_link(module);
-        ((body.rotation().inverse() * body.linvel()).to_array(), body.translation().z)
+        let own = self.own_link(module);
+        (own.seen(own.linear), own.position[2])
     }
 
     /// A world point in the own frame of a module.
     pub fn in_own_frame(&self, module: usize, point: [f32; 3]) -> [f32; 3] {
-        self.own_link(module).position().inverse_transform_point(Vector::from(point)).to_array()
+        self.own_link(module).pose().inverse_transform_point(Vector::from(point)).to_array()
     }
 
     /// Centre of the head link in the world.
     pub fn head(&self) -> [f32; 3] {
-        self.world.bodies[self.links[0]].translation().to_array()
+        self.state.links[0].position
     }
 
     /// A world point in the frame of the head link.
     pub fn in_head_frame(&self, point: [f32; 3]) -> [f32; 3] {
-        self.world.bodies[self.links[0]].position().inverse_transform_point(Vector::from(point)).to_array()
+        self.state.links[0].pose().inverse_transform_point(Vector::from(point)).to_array()
     }
 
     /// Distance of the centre of the head link to a world point.
     pub fn head_distance(&self, point: [f32; 3]) -> f32 {
-        let [x, y, z] = self.in_head_frame(point);
-        libm::sqrtf(x * x + y * y + z * z)
+        Vector::from(self.head()).distance(Vector::from(point))
     }
 
     /// Position and rotation (quaternion x, y, z, w) of every link, from the head on.
     pub fn poses(&self) -> impl Iterator<Item = ([f32; 3], [f32; 4])> + '_ {
-        self.links.iter().map(|&link| {
-            let body = &self.world.bodies[link];
-            let r = body.rotation();
-            (body.translation().to_array(), [r.x, r.y, r.z, r.w])
-        })
+        self.state.links.iter().map(|link| (link.position, link.rotation))
     }
 
     /// Height of the highest link centre now, units above the ground.
     pub fn height(&self) -> f32 {
-        self.links.iter().map(|&l| self.world.bodies[l].translation().z).fold(0.0, f32::max)
+        self.state.links.iter().map(|link| link.position[2]).fold(0.0, f32::max)
     }
 
     /// Kinetic plus potential energy (gravity and joint springs) of snake and block, for tests of the physics.
     pub fn energy(&self) -> f32 {
-        let bodies = self.links.iter().map(|&l| &self.world.bodies[l]);
-        let moving: f32 = bodies
-            .map(|b| {
-                0.5 * self.robot.link_mass * b.linvel().length_squared()
-                    + 0.5 * self.robot.link_inertia * b.angvel().length_squared()
-                    + self.robot.link_mass * self.robot.gravity * b.translation().z
-            })
-            .sum();
-        let springs: f32 =
-            (0..self.joints.len()).map(|j| 0.5 * self.robot.stiffness * self.joint_angle(j).powi(2)).sum();
-        let block = self.block.map_or(0.0, |block| {
-            let body = &self.world.bodies[block];
-            body.kinetic_energy() + body.mass() * self.robot.gravity * body.translation().z
+        let robot = &self.robot;
+        let square = |v: [f32; 3]| v.iter().map(|x| x * x).sum::<f32>();
+        let links = self.state.links.iter().map(|link| {
+            0.5 * robot.link_mass * square(link.linear)
+                + 0.5 * robot.link_inertia * square(link.angular)
+                + robot.link_mass * robot.gravity * link.position[2]
         });
-        moving + springs + block
+        let springs = self.state.joint_angles.iter().map(|angle| 0.5 * robot.stiffness * angle * angle);
+        let block = self.state.block.map_or(0.0, |block| {
+            let turning: f32 =
+                block.seen(block.angular).iter().zip(self.block_moments).map(|(w, moment)| 0.5 * moment * w * w).sum();
+            turning + self.block_mass * (0.5 * square(block.linear) + robot.gravity * block.position[2])
+        });
+        links.sum::<f32>() + springs.sum::<f32>() + block
     }
 
     /// Largest distance between the two halves of a joint, units: how far the solver let the chain come apart.
     pub fn joint_gap(&self) -> f32 {
         let half = Vector::new(0.5 * self.robot.link_length, 0.0, 0.0);
-        let gap = |pair: &[RigidBodyHandle]| {
-            let (front, rear) = (self.world.bodies[pair[0]].position(), self.world.bodies[pair[1]].position());
-            front.transform_point(-half).distance(rear.transform_point(half))
-        };
-        self.links.windows(2).map(gap).fold(0.0, f32::max)
+        let gap =
+            |pair: &[LinkState]| pair[0].pose().transform_point(-half).distance(pair[1].pose().transform_point(half));
+        self.state.links.windows(2).map(gap).fold(0.0, f32::max)
     }
 
     /// Extremes of the motion so far.
     pub fn motion(&self) -> Motion {
         self.motion
+    }
+}
+
+#[cfg(test)]
+impl Snake {
+    /// The direct solver's own state.
+    fn chain(&mut self) -> &mut chain::Chain {
+        match &mut self.engine {
+            Engine::Direct(chain) => chain,
+            _ => unreachable!("these tests run on the direct solver"),
+        }
     }
 }
 

@@ -1,9 +1,5 @@
 //! What stands on the ground besides the snake.
 
-use rapier3d::prelude::*;
-
-use super::SCENE;
-
 /// A box that does not move: a wall, a panel of a tube.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Solid {
@@ -23,16 +19,6 @@ impl Solid {
         let ((sy, cy), (sr, cr)) = (libm::sincosf(0.5 * self.yaw), libm::sincosf(0.5 * self.roll));
         [cy * sr, sy * sr, sy * cr, cy * cr]
     }
-
-    fn collider(&self) -> ColliderBuilder {
-        let [x, y, z] = self.half;
-        let [px, py, pz] = self.position;
-        let [a, b, c, d] = self.rotation();
-        ColliderBuilder::cuboid(x, y, z)
-            .position(Pose::from_parts(Vector::new(px, py, pz), Rotation::from_xyzw(a, b, c, d)))
-            .friction(0.0)
-            .collision_groups(SCENE)
-    }
 }
 
 /// A box that can be pushed.
@@ -46,7 +32,7 @@ pub struct Block {
     pub yaw: f32,
     /// Mass, kg.
     pub mass: f32,
-    /// Coefficient of friction with the ground and with the snake's body.
+    /// Coefficient of its friction on ground and solids, the same in every direction. On the snake's body it is the snake's own.
     pub friction: f32,
 }
 
@@ -59,34 +45,17 @@ pub struct Scene {
     pub block: Option<Block>,
 }
 
-impl Scene {
-    /// Puts it all into the world; returns the body of the block.
-    pub(super) fn build(&self, world: &mut PhysicsWorld) -> Option<RigidBodyHandle> {
-        for solid in &self.solids {
-            world.colliders.insert(solid.collider().build());
-        }
-        let block = self.block?;
-        let [x, y, z] = block.position;
-        let body = RigidBodyBuilder::dynamic()
-            .translation(Vector::new(x, y, z))
-            .rotation(Vector::new(0.0, 0.0, block.yaw))
-            .can_sleep(false);
-        let handle = world.bodies.insert(body);
-        let [hx, hy, hz] = block.half;
-        // Its friction counts, whatever the other side's: rapier's own isotropic friction keeps a block at rest at rest.
-        let collider = ColliderBuilder::cuboid(hx, hy, hz)
-            .mass(block.mass)
-            .friction(block.friction)
-            .friction_combine_rule(CoefficientCombineRule::Max)
-            .collision_groups(SCENE);
-        world.colliders.insert_with_parent(collider, handle, &mut world.bodies);
-        Some(handle)
+impl Block {
+    /// Moments of inertia about its own axes, kg units^2: those of a box that is as heavy everywhere.
+    pub fn moments(&self) -> [f32; 3] {
+        let [x, y, z] = self.half.map(|h| h * h * self.mass / 3.0);
+        [y + z, x + z, x + y]
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::Snake;
+    use super::super::{LinkState, Snake};
     use super::*;
     use crate::robot::Robot;
 
@@ -97,23 +66,20 @@ mod tests {
         Scene { solids: vec![Solid { half, position, yaw: 0.0, roll: 0.0 }], block: None }
     }
 
-    fn body(snake: &mut Snake, handle: RigidBodyHandle) -> &mut RigidBody {
-        &mut snake.world.bodies[handle]
-    }
-
     /// Moves the whole snake.
-    fn shift(snake: &mut Snake, by: Vector) {
-        for link in snake.links.clone() {
-            let place = body(snake, link).translation() + by;
-            body(snake, link).set_translation(place, true);
-        }
+    fn shift(snake: &mut Snake, by: [f32; 3]) {
+        snake.chain().shift(by);
+        snake.read();
     }
 
     /// Sets the velocity of every link.
-    fn throw(snake: &mut Snake, velocity: Vector) {
-        for link in snake.links.clone() {
-            body(snake, link).set_linvel(velocity, true);
-        }
+    fn throw(snake: &mut Snake, velocity: [f32; 3]) {
+        snake.chain().throw(velocity);
+        snake.read();
+    }
+
+    fn speed(link: &LinkState) -> f32 {
+        link.linear.iter().map(|v| v * v).sum::<f32>().sqrt()
     }
 
     /// Two seconds with the motors off. The energy never rises above what it was within the last quarter of a second, for so long the
@@ -141,11 +107,11 @@ mod tests {
         let robot = Robot::default();
         // Thrown at a wall, head first and sideways.
         for (scene, velocity) in [
-            (wall([1.5, 0.0, 1.0], [0.5, 20.0, 1.0]), Vector::new(20.0, 0.0, 0.0)),
-            (wall([0.0, 1.5, 1.0], [40.0, 0.5, 1.0]), Vector::new(0.0, 20.0, 0.0)),
+            (wall([1.5, 0.0, 1.0], [0.5, 20.0, 1.0]), [20.0, 0.0, 0.0]),
+            (wall([0.0, 1.5, 1.0], [40.0, 0.5, 1.0]), [0.0, 20.0, 0.0]),
             // A block, and a block with a wall behind it.
-            (Scene { block: Some(BLOCK), ..Scene::default() }, Vector::new(20.0, 0.0, 0.0)),
-            (Scene { block: Some(BLOCK), ..wall([4.6, 0.0, 1.0], [0.5, 20.0, 1.0]) }, Vector::new(20.0, 0.0, 0.0)),
+            (Scene { block: Some(BLOCK), ..Scene::default() }, [20.0, 0.0, 0.0]),
+            (Scene { block: Some(BLOCK), ..wall([4.6, 0.0, 1.0], [0.5, 20.0, 1.0]) }, [20.0, 0.0, 0.0]),
         ] {
             let mut snake = Snake::in_scene(&robot, &scene);
             throw(&mut snake, velocity);
@@ -163,7 +129,7 @@ mod tests {
             Scene { block: Some(Block { position: [-5.0, 0.0, 0.5], ..BLOCK }), ..Scene::default() },
         ] {
             let mut snake = Snake::in_scene(&robot, &scene);
-            shift(&mut snake, Vector::new(0.0, 0.0, 2.0));
+            shift(&mut snake, [0.0, 0.0, 2.0]);
             energy_falls(&mut snake);
         }
     }
@@ -172,27 +138,27 @@ mod tests {
     fn friction_on_a_solid_is_that_of_the_contacts_own_load_and_normal() {
         let robot = Robot::default();
         // Speed lost in 0.1 s along and across the links, by a snake that a sideways pull presses against what is beside it.
-        let lost = |scene: &Scene, pull: f32, velocity: Vector| {
+        let lost = |scene: &Scene, pull: f32, velocity: [f32; 3]| {
             let mut snake = Snake::in_scene(&robot, scene);
-            snake.world.gravity.y = pull;
+            snake.chain().pull([0.0, pull, -robot.gravity]);
             (0..20).for_each(|_| snake.step());
             throw(&mut snake, velocity);
             (0..10).for_each(|_| snake.step());
-            let mean = snake.links.iter().map(|l| snake.world.bodies[*l].linvel().length()).sum::<f32>() / 32.0;
-            velocity.length() - mean
+            let mean = snake.state().links.iter().map(speed).sum::<f32>() / 32.0;
+            velocity.iter().sum::<f32>() - mean
         };
         let g = 0.1 * robot.gravity;
         let near = |got: f32, want: f32| assert!((got - want).abs() < 0.05 * want, "{got} instead of {want}");
         let plain = Scene::default();
-        near(lost(&plain, 0.0, Vector::new(30.0, 0.0, 0.0)), g * robot.friction_along);
+        near(lost(&plain, 0.0, [30.0, 0.0, 0.0]), g * robot.friction_along);
         // A wall takes the pull, and adds its own friction to the ground's.
         let beside = wall([-8.0, 0.9 + 1e-3, 5.0], [20.0, 0.5, 5.0]);
-        near(lost(&beside, robot.gravity, Vector::new(30.0, 0.0, 0.0)), 2.0 * g * robot.friction_along);
+        near(lost(&beside, robot.gravity, [30.0, 0.0, 0.0]), 2.0 * g * robot.friction_along);
         // Up along the wall: across the links, and gravity, and nothing from the ground.
-        near(lost(&beside, robot.gravity, Vector::new(0.0, 0.0, 60.0)), g * (1.0 + robot.friction_across));
+        near(lost(&beside, robot.gravity, [0.0, 0.0, 60.0]), g * (1.0 + robot.friction_across));
         // On top of a solid as on the ground.
         let floor = wall([-8.0, 0.0, -0.5], [20.0, 20.0, 0.5 + 1e-3]);
-        near(lost(&floor, 0.0, Vector::new(0.0, 30.0, 0.0)), g * robot.friction_across);
+        near(lost(&floor, 0.0, [0.0, 30.0, 0.0]), g * robot.friction_across);
     }
 
     #[test]
@@ -203,11 +169,11 @@ mod tests {
             let mut scene = wall([-8.0, 0.9 - tight, 1.0], [20.0, 0.5, 1.0]);
             scene.solids.push(Solid { position: [-8.0, -0.9 + tight, 1.0], ..scene.solids[0] });
             let mut snake = Snake::in_scene(&robot, &scene);
-            throw(&mut snake, Vector::new(1.0, 0.0, 0.0));
+            throw(&mut snake, [1.0, 0.0, 0.0]);
             for step in 0..200 {
                 snake.step();
-                let speeds = snake.links.iter().map(|l| snake.world.bodies[*l].linvel());
-                let (back, fastest) = speeds.fold((0.0f32, 0.0f32), |(b, f), v| (b.max(-v.x), f.max(v.length())));
+                let links = snake.state().links.iter();
+                let (back, fastest) = links.fold((0.0f32, 0.0f32), |(b, f), l| (b.max(-l.linear[0]), f.max(speed(l))));
                 assert!(back < 0.1 && fastest < 1.1, "{tight}, step {step}: {fastest}, back {back}");
                 assert!(step < 150 || fastest < 0.02, "{tight}, step {step}: {fastest}");
             }
@@ -247,14 +213,13 @@ mod tests {
             let block = Block { position: [5.0, 0.0, 0.5], yaw: 0.0, friction, ..BLOCK };
             let mut snake = Snake::in_scene(&Robot::default(), &Scene { block: Some(block), ..Scene::default() });
             (0..20).for_each(|_| snake.step());
-            let handle = snake.block.unwrap();
-            body(&mut snake, handle).set_linvel(Vector::new(10.0, 0.0, 0.0), true);
+            snake.chain().push_block([10.0, 0.0, 0.0]);
             (0..150).for_each(|_| snake.step());
             let ([x, y, z], _) = snake.block().unwrap();
             let way = 10.0f32.powi(2) / (2.0 * friction * 196.2);
             assert!((x - 5.0 - way).abs() < 0.1 * way + 0.06, "friction {friction}: {} instead of {way}", x - 5.0);
             assert!(y.abs() < 0.02 && (z - 0.5).abs() < 0.01, "{y} {z}");
-            assert!(body(&mut snake, handle).linvel().length() < 1e-3);
+            assert!(speed(&snake.state().block.unwrap()) < 1e-3);
         }
     }
 }

@@ -1,6 +1,6 @@
 //! The checkpoint: one file with all that a run needs to go on bit for bit.
 //!
-//! Layout, little-endian: magic `CMPSRCK2`, then the fields of [`Checkpoint`] in order (lists and texts after
+//! Layout, little-endian: magic `CMPSRCK3`, then the fields of [`Checkpoint`] in order (lists and texts after
 //! their length as u64), then the CRC-32 of everything before.
 //! A new one is written beside the old one, made durable and renamed, so that there is a whole one at every moment.
 
@@ -16,7 +16,7 @@ use crate::methods::actor_critic::OUT;
 /// File name of the checkpoint in the folder of a run.
 pub const FILE: &str = "checkpoint.bin";
 
-const MAGIC: &[u8; 8] = b"CMPSRCK2";
+const MAGIC: &[u8; 8] = b"CMPSRCK3";
 /// How the magic numbers of all versions begin.
 const FAMILY: &[u8] = b"CMPSRCK";
 const CRC: crc::Crc<u32> = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC);
@@ -31,7 +31,7 @@ pub enum CheckpointError {
     #[error("the checkpoint {0} cannot be read: {1}")]
     Read(String, io::Error),
     /// Not a checkpoint.
-    #[error("{0} is no training checkpoint of this program (it does not start with CMPSRCK2)")]
+    #[error("{0} is no training checkpoint of this program (it does not start with CMPSRCK3)")]
     Magic(String),
     /// Of another version.
     #[error(
@@ -66,6 +66,8 @@ pub struct LearnerState {
     pub parameters: [Vec<f32>; 6],
     /// Statistics of the returns.
     pub value_norm: [f64; 3],
+    /// Learning rate of the next update, if it is adapted.
+    pub learning_rate: f32,
 }
 
 /// The state of a run between two iterations.
@@ -102,6 +104,7 @@ impl Checkpoint {
                 parameters.iter().for_each(|p| out.extend_from_slice(&p.to_le_bytes()));
             }
             learner.value_norm.iter().for_each(|n| out.extend_from_slice(&n.to_le_bytes()));
+            out.extend_from_slice(&learner.learning_rate.to_le_bytes());
         }
         number(&mut out, self.statistics.len() as u64);
         self.statistics.iter().for_each(|s| out.extend_from_slice(&s.to_le_bytes()));
@@ -128,6 +131,7 @@ impl Checkpoint {
             for number in &mut learner.value_norm {
                 *number = f64::from_bits(reader.number()?);
             }
+            learner.learning_rate = reader.float()?;
             checkpoint.learners.push(learner);
         }
         let count = reader.length(8)?;
@@ -182,6 +186,12 @@ impl Reader<'_> {
         Some(u64::from_le_bytes(*bytes))
     }
 
+    fn float(&mut self) -> Option<f32> {
+        let (bytes, rest) = self.0.split_first_chunk::<4>()?;
+        self.0 = rest;
+        Some(f32::from_le_bytes(*bytes))
+    }
+
     /// A count of things of `size` bytes each, which must still be there.
     fn length(&mut self, size: usize) -> Option<usize> {
         let count = usize::try_from(self.number()?).ok()?;
@@ -221,6 +231,7 @@ mod tests {
                     adam_steps: [n, n + 1],
                     parameters: std::array::from_fn(|i| vec![0.1 * i as f32, f32::MIN_POSITIVE, -(n as f32)]),
                     value_norm: [0.1 * n as f64, -0.0, f64::MAX],
+                    learning_rate: 1e-3 * n as f32,
                 })
                 .into(),
             statistics: vec![1.0 / 3.0, f64::EPSILON],

@@ -18,14 +18,14 @@ use self::checkpoint::{Checkpoint, Episode, LearnerState};
 use self::metrics::Metrics;
 use self::progress::{Progress, Times};
 use crate::environment::{Environment, PRIVILEGED};
+use crate::methods::actor::Actor;
 use crate::methods::actor_critic::ActorLayout;
 use crate::methods::buffer::Experience;
 use crate::methods::imagination::{Imagination, ImaginationConfig};
-use crate::methods::inference::Inference;
 use crate::methods::normalise::{Running, ValueNorm};
-use crate::methods::ppo::{Learner, PpoSettings, update};
+use crate::methods::ppo::{Learner, PpoSettings, RATE_LIMITS, Workspace, update};
 use crate::methods::rollout::{Frozen, Iteration, Slot, collect};
-use crate::methods::{Method, Stream, derive_seed};
+use crate::methods::{Differentiation, Method, Stream, derive_seed};
 use crate::network::Network;
 
 /// Settings of the learner. Every field has a default, so that a TOML file needs to name only what it changes.
@@ -58,8 +58,11 @@ pub struct TrainConfig {
     pub kl_stop: f64,
     /// Adam's learning rate at the start.
     pub learning_rate: f64,
-    /// Share of it that is left at the end; linear in between.
+    /// Share of it that is left at the end; linear in between. Without effect if `kl_target` is set.
     pub learning_rate_end: f64,
+    /// KL divergence an update of the actor should come to. Above 0 the learning rate of each policy is divided by 1.5 after an iteration
+    /// whose last minibatch was beyond twice that, multiplied by 1.5 if it was below half of it, and stays between 1e-5 and 1e-2.
+    pub kl_target: f64,
     /// Adam's epsilon.
     pub adam_epsilon: f64,
     /// Limit of the norm of the actor's gradient, over all its parameters.
@@ -70,6 +73,10 @@ pub struct TrainConfig {
     pub entropy: f64,
     /// Standard deviation of the actions at the start, as a fraction of the torque limit.
     pub sigma: f64,
+    /// Least standard deviation of an action, as a fraction of the torque limit (for the imagination policy: of its bound); 0 for none.
+    pub sigma_min: f64,
+    /// What computes the gradients: `manual` (written by hand, fast) or `automatic` (burn's autodiff, the reference).
+    pub gradient: Differentiation,
     /// Environment steps between two evaluations; 0 for none.
     pub evaluate_every: u64,
     /// Episodes of each evaluation.
@@ -99,11 +106,14 @@ impl Default for TrainConfig {
             kl_stop: 0.03,
             learning_rate: 5e-4,
             learning_rate_end: 0.1,
+            kl_target: 0.0,
             adam_epsilon: 1e-5,
             actor_grad_norm: 0.5,
             critic_grad_norm: 1.0,
             entropy: 0.0,
             sigma: 0.45,
+            sigma_min: 0.0,
+            gradient: Differentiation::default(),
             evaluate_every: 100_000,
             evaluation_episodes: 50,
             checkpoint_seconds: 60.0,
@@ -144,8 +154,21 @@ impl TrainConfig {
                 bail!("{key} is {value}; it must be from 0 to 1");
             }
         }
-        if !(self.entropy.is_finite() && self.entropy >= 0.0) {
-            bail!("entropy is {}; it must be 0 or more", self.entropy);
+        for (key, value) in [("entropy", self.entropy), ("kl_target", self.kl_target), ("sigma_min", self.sigma_min)] {
+            if !(value.is_finite() && value >= 0.0) {
+                bail!("{key} is {value}; it must be 0 or more");
+            }
+        }
+        let [low, high] = RATE_LIMITS.map(f64::from);
+        if self.kl_target > 0.0 && !(low..=high).contains(&self.learning_rate) {
+            bail!("learning_rate is {}; with a kl_target it must be from 0.00001 to 0.01", self.learning_rate);
+        }
+        if self.sigma_min > self.sigma {
+            bail!("sigma_min is {}; it must not be above sigma, {}", self.sigma_min, self.sigma);
+        }
+        let imagination = self.imagination.sigma;
+        if self.method.imagination() && self.sigma_min > imagination {
+            bail!("sigma_min is {}; it must not be above imagination.sigma, {imagination}", self.sigma_min);
         }
         if self.checkpoint_seconds.is_nan() || self.checkpoint_seconds < 0.0 {
             bail!("checkpoint_seconds is {}; it must be 0 or more", self.checkpoint_seconds);
@@ -179,7 +202,7 @@ impl TrainConfig {
         self.total_steps.div_ceil(self.steps_per_iteration())
     }
 
-    /// Learning rate of an iteration.
+    /// Learning rate of an iteration, if it falls linearly.
     pub fn learning_rate_at(&self, iteration: u64) -> f32 {
         let done = iteration as f64 / self.iterations().max(1) as f64;
         (self.learning_rate * (1.0 - done * (1.0 - self.learning_rate_end))) as f32
@@ -198,6 +221,9 @@ impl TrainConfig {
             entropy: self.entropy as f32,
             actor_grad_norm: self.actor_grad_norm as f32,
             critic_grad_norm: self.critic_grad_norm as f32,
+            kl_target: self.kl_target as f32,
+            sigma_min: self.sigma_min as f32,
+            gradient: self.gradient,
         }
     }
 }
@@ -236,6 +262,7 @@ pub struct Trainer {
     slots: Vec<Slot>,
     experience: Experience,
     iteration: u64,
+    workspace: Workspace,
 }
 
 /// What an iteration did.
@@ -263,12 +290,14 @@ impl Trainer {
             slots.push(Slot::new(checked(make(index)?, index)?, index, config.seed));
         }
         let epsilon = config.adam_epsilon as f32;
-        let control = Learner::new(ActorLayout::control(config.method), config.seed, config.sigma as f32, 1.0, epsilon);
+        let rate = config.learning_rate as f32;
+        let layout = ActorLayout::control(config.method);
+        let control = Learner::new(layout, config.seed, config.sigma as f32, 1.0, epsilon, rate);
         let imagination = config.method.imagination().then(|| {
             let seed = derive_seed(config.seed, Stream::Imagination, 0, 0);
             let sigma = config.imagination.sigma as f32;
             // What is imagined earns a tenth of a unit: a critic that starts with numbers of size 1 would take long to get there.
-            Learner::new(ActorLayout::imagination(), seed, sigma, 0.01, epsilon)
+            Learner::new(ActorLayout::imagination(), seed, sigma, 0.01, epsilon, rate)
         });
         Ok(Self {
             control,
@@ -278,6 +307,7 @@ impl Trainer {
             experience: Experience::new(config.environments),
             slots,
             iteration: 0,
+            workspace: Workspace::new(config.threads()).context("the threads cannot be started")?,
             config: config.clone(),
             fingerprint: fingerprint.into(),
         })
@@ -362,10 +392,9 @@ impl Trainer {
     /// Collects and learns once.
     pub fn iterate(&mut self) -> Result<Report> {
         let began = Instant::now();
-        let threads = self.config.threads();
-        let policy = Inference::new(&self.control.layout, &self.control.actor);
+        let policy = Actor::new(self.control.layout, &self.control.actor);
         let settings = &self.config.imagination;
-        let imagined_by = self.imagination.as_ref().map(|learner| Inference::new(&learner.layout, &learner.actor));
+        let imagined_by = self.imagination.as_ref().map(|learner| Actor::new(learner.layout, &learner.actor));
         let imagination = self.imagination.as_ref().zip(imagined_by.as_ref()).map(|(learner, policy)| Imagination {
             policy,
             seed: learner.seed,
@@ -382,16 +411,23 @@ impl Trainer {
             steps: self.config.rollout_steps,
         };
         let (observations, privileged) = (&mut self.observations, &mut self.privileged);
-        let split = collect(&mut self.slots, &mut self.experience, iteration, threads, observations, privileged);
+        let workers = &self.workspace.workers;
+        let split = collect(&mut self.slots, &mut self.experience, iteration, workers, observations, privileged);
         let rollout = began.elapsed();
-        let learning_rate = self.config.learning_rate_at(self.iteration);
+        let linear = self.config.learning_rate_at(self.iteration);
+        let adaptive = self.config.kl_target > 0.0;
+        let rate_of = |learner: &Learner| if adaptive { learner.learning_rate } else { linear };
+        let learning_rate = rate_of(&self.control);
         let ppo = self.config.ppo();
+        let workspace = &mut self.workspace;
         let Experience { lanes, control, imagination } = &mut self.experience;
-        let stats = update(&mut self.control, lanes, control, &ppo, learning_rate, self.iteration, threads);
+        let stats = update(&mut self.control, lanes, control, &ppo, learning_rate, self.iteration, workspace);
         let imagination_stats = self.imagination.as_mut().map(|learner| {
             let epochs = settings.epochs;
             let ppo = PpoSettings { gamma: settings.gamma as f32, epochs, critic_epochs: epochs, ..ppo };
-            update(learner, lanes, imagination, &ppo, learning_rate, self.iteration, threads)
+            let rate = rate_of(learner);
+            let stats = update(learner, lanes, imagination, &ppo, rate, self.iteration, workspace);
+            (stats, rate)
         });
         if ![Some(&self.control), self.imagination.as_ref()].into_iter().flatten().all(Learner::is_finite) {
             bail!(
@@ -431,11 +467,12 @@ impl Trainer {
             ("charts/sigma".into(), self.control.sigma()),
         ];
         scalars.extend(stats.scalars().map(|(name, value)| (format!("losses/{name}"), value)));
-        if let (Some(learner), Some(stats)) = (&self.imagination, imagination_stats) {
+        if let (Some(learner), Some((stats, rate))) = (&self.imagination, imagination_stats) {
             let rewards: f64 = imagination.iter().flat_map(|track| &track.rewards).map(|r| f64::from(*r)).sum();
             let errors: f64 = lanes.iter().flat_map(|lane| &lane.follow_errors).map(|e| f64::from(*e)).sum();
             scalars.push(("imagination/reward".into(), rewards / steps));
             scalars.push(("imagination/follow_error".into(), errors / steps));
+            scalars.push(("imagination/learning_rate".into(), f64::from(rate)));
             scalars.push(("imagination/sigma".into(), learner.sigma()));
             scalars.extend(stats.scalars().map(|(name, value)| (format!("imagination/{name}"), value)));
         }
@@ -471,18 +508,19 @@ impl Trainer {
 
 /// What a checkpoint keeps of a learner.
 fn state(learner: &Learner) -> LearnerState {
-    let Learner { actor, critic, actor_adam, critic_adam, value_norm, .. } = learner;
+    let Learner { actor, critic, actor_adam, critic_adam, value_norm, learning_rate, .. } = learner;
     let vectors = [actor, &actor_adam.first, &actor_adam.second, critic, &critic_adam.first, &critic_adam.second];
     LearnerState {
         adam_steps: [actor_adam.steps, critic_adam.steps],
         parameters: vectors.map(Clone::clone),
         value_norm: value_norm.numbers(),
+        learning_rate: *learning_rate,
     }
 }
 
 /// Brings a new learner to where one was.
 fn restore(learner: &mut Learner, state: &LearnerState) -> Result<()> {
-    let Learner { actor, critic, actor_adam, critic_adam, value_norm, .. } = learner;
+    let Learner { actor, critic, actor_adam, critic_adam, value_norm, learning_rate, .. } = learner;
     let vectors =
         [actor, &mut actor_adam.first, &mut actor_adam.second, critic, &mut critic_adam.first, &mut critic_adam.second];
     for (to, from) in vectors.into_iter().zip(&state.parameters) {
@@ -493,6 +531,7 @@ fn restore(learner: &mut Learner, state: &LearnerState) -> Result<()> {
     }
     [actor_adam.steps, critic_adam.steps] = state.adam_steps;
     *value_norm = ValueNorm::from_numbers(&mut state.value_norm.into_iter()).unwrap_or_default();
+    *learning_rate = state.learning_rate;
     Ok(())
 }
 
@@ -673,7 +712,9 @@ mod tests {
     #[test]
     fn six_iterations_are_three_and_a_resumption_and_three() {
         for method in Method::ALL {
-            let config = TrainConfig { total_steps: 6 * 96, ..small(method) };
+            // With a learning rate that falls and with one that is adapted.
+            let kl_target = if method.imagination() { 0.01 } else { 0.0 };
+            let config = TrainConfig { total_steps: 6 * 96, kl_target, ..small(method) };
             let mut straight = Trainer::new(&config, &teams, "trivial").unwrap();
             let reports: Vec<_> = (0..6).map(|_| straight.iterate().unwrap().scalars).collect();
 
@@ -763,6 +804,10 @@ mod tests {
             ("total_steps = 0", "total_steps is 0"),
             ("learning_rate = nan", "learning_rate is NaN"),
             ("entropy = -0.1", "entropy is -0.1; it must be 0 or more"),
+            ("kl_target = -0.01", "kl_target is -0.01; it must be 0 or more"),
+            ("kl_target = 0.01\nlearning_rate = 0.1", "learning_rate is 0.1; with a kl_target it must be from 0.00001"),
+            ("sigma_min = 0.5", "sigma_min is 0.5; it must not be above sigma, 0.45"),
+            ("sigma = 0.8\nsigma_min = 0.5", "sigma_min is 0.5; it must not be above imagination.sigma, 0.45"),
         ] {
             let config: TrainConfig = toml::from_str(text).unwrap();
             let error = config.validate().unwrap_err().to_string();
@@ -778,6 +823,18 @@ mod tests {
         let config = small(Method::Mappo);
         let checkpoint = Trainer::new(&config, &teams, "trivial").unwrap().checkpoint().unwrap();
         assert_eq!(config_of(&checkpoint).unwrap(), config);
+    }
+
+    #[test]
+    fn an_adapted_learning_rate_grows_while_the_policy_hardly_moves() {
+        let config = TrainConfig { kl_target: 1.0, kl_stop: 10.0, ..small(Method::Composer) };
+        let mut trainer = Trainer::new(&config, &teams, "trivial").unwrap();
+        let rates = [0, 1, 2].map(|_| trainer.iterate().unwrap());
+        for (report, expected) in rates.iter().zip([5e-4, 7.5e-4, 1.125e-3]) {
+            for name in ["charts/learning_rate", "imagination/learning_rate"] {
+                assert!((report.get(name) - expected).abs() < 1e-8, "{name}: {}", report.get(name));
+            }
+        }
     }
 
     #[test]
@@ -833,7 +890,7 @@ mod tests {
         let trainer = trained(Method::ComposerNoAttention, 40_000, drift);
         let network = trainer.network();
         let learner = trainer.imagination().unwrap();
-        let imagination = Inference::new(&learner.layout, &learner.actor);
+        let imagination = Actor::new(learner.layout, &learner.actor);
         let bound = trainer.config.imagination.bound as f32;
         let mut scratch = Default::default();
         let (mut env, mut view) = (Drift::new(3), View::default());
@@ -847,8 +904,7 @@ mod tests {
                     .iter()
                     .flat_map(|o| (0..SIZE).map(|i| ((o[i] - network.mean[i]) / network.std[i]).clamp(-5.0, 5.0)))
                     .collect();
-                let mut means = [[0.0; 3]; 3];
-                imagination.means(&normalised, &view.heard, &mut means, &mut scratch);
+                let means = imagination.means(&normalised, &view.heard, &[3], &mut scratch).as_chunks().0;
                 let imagined: Vec<_> = (0..3).map(|m| env.place(m, displacement(means[m], bound))).collect();
                 earned += env.imagined_reward(&imagined);
                 let best = view.observations.iter().map(|o| o[0].hypot(o[1]).min(bound)).sum::<f32>() / 3.0;

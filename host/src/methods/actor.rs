@@ -1,0 +1,318 @@
+//! The actor: its forward pass, the same for rollouts and updates, and the gradient of PPO's clipped loss, derived by hand.
+//!
+//! Plain f32 over whole teams, no tensor library, no allocation once the working memory has grown. What a module does depends on its own
+//! team alone, bit for bit: a batch of many teams and a rollout of one agree.
+
+use composer_shared::observation::SIZE;
+
+use super::actor_critic::{
+    ActorLayout, Batch, EMBED, Gradient, HIDDEN, KEY, LOG_DENSITY_CONSTANT, PpoLoss, VALUE, room, transpose,
+    transpose_back,
+};
+use super::kernels::{Start, bias_tanh_backward, dense, dense_weights, dot, head, head_backward, tanh};
+use super::simd::{Vector, vectorise};
+
+/// Query, key and value of one module in a row.
+const LATENT: usize = 2 * KEY + VALUE;
+
+/// An actor's weights, ready for both ways.
+#[derive(Clone, Debug)]
+pub struct Actor {
+    layout: ActorLayout,
+    /// As in the layout, one row per output.
+    parameters: Vec<f32>,
+    /// The same with one row per input in the matrices of [`matrices`].
+    transposed: Vec<f32>,
+}
+
+/// Working memory of an actor: what its layers put out, and the gradients of that. `rows` are modules of all teams together.
+#[derive(Clone, Debug, Default)]
+pub struct ActorScratch {
+    /// Means of the actions, `[rows, outputs]`; longer than that after a larger batch.
+    pub means: Vec<f32>,
+    /// `[rows, EMBED]`
+    embedding: Vec<f32>,
+    /// `[rows, LATENT]`
+    latent: Vec<f32>,
+    /// Weights of attention: `[modules, modules]` for each team.
+    attention: Vec<f32>,
+    /// `[rows, VALUE]`
+    context: Vec<f32>,
+    /// `[rows, HIDDEN]`
+    hidden: Vec<f32>,
+    of_means: Vec<f32>,
+    of_embedding: Vec<f32>,
+    of_latent: Vec<f32>,
+    of_context: Vec<f32>,
+    of_hidden: Vec<f32>,
+}
+
+/// The matrices that are kept transposed. The output layer is too narrow to gain by it.
+fn matrices(layout: &ActorLayout) -> [super::Block; 4] {
+    [layout.encoder, layout.attention, layout.hidden, layout.hidden_context]
+}
+
+impl Actor {
+    /// An actor with these parameters.
+    pub fn new(layout: ActorLayout, parameters: &[f32]) -> Self {
+        let mut actor = Self { layout, parameters: vec![0.0; layout.len], transposed: vec![0.0; layout.len] };
+        actor.load(parameters);
+        actor
+    }
+
+    /// The parameters, in the order of the layout.
+    pub fn parameters(&self) -> &[f32] {
+        &self.parameters
+    }
+
+    /// Takes other parameters.
+    pub fn load(&mut self, parameters: &[f32]) {
+        self.parameters.copy_from_slice(parameters);
+        transpose(parameters, &matrices(&self.layout), &mut self.transposed);
+    }
+
+    /// Logarithm of the standard deviation of each action.
+    pub fn log_sigma(&self) -> &[f32] {
+        &self.parameters[self.layout.log_sigma.range()]
+    }
+
+    fn has_attention(&self) -> bool {
+        !self.layout.attention.is_empty()
+    }
+
+    /// Means of the actions of some teams, `[rows, outputs]`: `observations` normalised, `[rows, SIZE]`; `heard` one mask a row, own bit
+    /// set; `modules` of each team.
+    pub fn means<'a>(
+        &self,
+        observations: &[f32],
+        heard: &[u64],
+        modules: &[usize],
+        scratch: &'a mut ActorScratch,
+    ) -> &'a [f32] {
+        let rows = heard.len();
+        let ActorScratch { means, embedding, latent, attention, context, hidden, .. } = scratch;
+        let layout = &self.layout;
+        let bias = |block: super::Block| &self.parameters[block.range()];
+        let matrix = |block: super::Block| &self.transposed[block.range()];
+        let embedding = room(embedding, rows * EMBED);
+        dense(observations, SIZE, matrix(layout.encoder), Start::Bias(bias(layout.encoder_bias)), embedding);
+        tanh(embedding);
+        let hidden = room(hidden, rows * HIDDEN);
+        dense(embedding, EMBED, matrix(layout.hidden), Start::Bias(bias(layout.hidden_bias)), hidden);
+        if self.has_attention() {
+            let latent = room(latent, rows * LATENT);
+            dense(embedding, EMBED, matrix(layout.attention), Start::Zero, latent);
+            let attention = room(attention, modules.iter().map(|n| n * n).sum());
+            let context = room(context, rows * VALUE);
+            attend(latent, heard, modules, attention, context);
+            dense(context, VALUE, matrix(layout.hidden_context), Start::Sum, hidden);
+        }
+        tanh(hidden);
+        let means = room(means, rows * layout.outputs());
+        head::<HIDDEN>(hidden, bias(layout.output), bias(layout.output_bias), means);
+        means
+    }
+
+    /// Adds PPO's clipped loss over a batch to `sum`, and its gradient, transposed: see [`Actor::finish`].
+    pub fn gradient(&self, batch: &Batch, loss: PpoLoss, scratch: &mut ActorScratch, sum: &mut Gradient) {
+        self.means(&batch.observations, &batch.heard, &batch.modules, scratch);
+        let (layout, rows) = (&self.layout, batch.rows());
+        let ActorScratch {
+            means,
+            embedding,
+            latent,
+            attention,
+            context,
+            hidden,
+            of_means,
+            of_embedding,
+            of_latent,
+            of_context,
+            of_hidden,
+        } = scratch;
+        let of_means = room(of_means, rows * layout.outputs());
+        clipped_loss(batch, &means[..rows * layout.outputs()], self.log_sigma(), loss, of_means, layout, sum);
+
+        let gradient = &mut sum.gradient;
+        let weights = |block: super::Block| &self.parameters[block.range()];
+        let (embedding, hidden) = (&embedding[..rows * EMBED], &hidden[..rows * HIDDEN]);
+        let of_hidden = room(of_hidden, rows * HIDDEN);
+        let (of_output, of_bias) = gradient[layout.output.offset..].split_at_mut(layout.output.len());
+        let of_bias = &mut of_bias[..layout.outputs()];
+        head_backward::<HIDDEN>(hidden, weights(layout.output), of_means, of_hidden, of_output, of_bias);
+        bias_tanh_backward(of_hidden, hidden, &mut gradient[layout.hidden_bias.range()]);
+        dense_weights(embedding, EMBED, of_hidden, &mut gradient[layout.hidden.range()]);
+        let of_embedding = room(of_embedding, rows * EMBED);
+        dense(of_hidden, HIDDEN, weights(layout.hidden), Start::Zero, of_embedding);
+        if self.has_attention() {
+            let (latent, context) = (&latent[..rows * LATENT], &context[..rows * VALUE]);
+            let (of_latent, of_context) = (room(of_latent, rows * LATENT), room(of_context, rows * VALUE));
+            dense_weights(context, VALUE, of_hidden, &mut gradient[layout.hidden_context.range()]);
+            dense(of_hidden, HIDDEN, weights(layout.hidden_context), Start::Zero, of_context);
+            attend_backward(latent, &batch.heard, &batch.modules, attention, of_context, of_latent);
+            dense_weights(embedding, EMBED, of_latent, &mut gradient[layout.attention.range()]);
+            dense(of_latent, LATENT, weights(layout.attention), Start::Sum, of_embedding);
+        }
+        bias_tanh_backward(of_embedding, embedding, &mut gradient[layout.encoder_bias.range()]);
+        dense_weights(&batch.observations, SIZE, of_embedding, &mut gradient[layout.encoder.range()]);
+    }
+
+    /// Writes a sum of gradients to `to` in the order of the parameters. The sum is in that order already (`ordered`) or as [`Actor::gradient`] makes it.
+    pub fn finish(&self, sum: &[f32], ordered: bool, to: &mut Vec<f32>) {
+        to.clear();
+        to.extend_from_slice(sum);
+        if !ordered {
+            transpose_back(sum, &matrices(&self.layout), to);
+        }
+    }
+}
+
+/// Adds PPO's clipped loss to `sum`, with its gradient over log sigma; that over the means goes into `of_means`.
+fn clipped_loss(
+    batch: &Batch,
+    means: &[f32],
+    log_sigma: &[f32],
+    loss: PpoLoss,
+    of_means: &mut [f32],
+    layout: &ActorLayout,
+    sum: &mut Gradient,
+) {
+    let outputs = log_sigma.len();
+    // Constants of the density cancel in the ratio, but log sigma does not: it is being learnt.
+    let constant = outputs as f32 * LOG_DENSITY_CONSTANT + log_sigma.iter().sum::<f32>();
+    let of_log_sigma = &mut sum.gradient[layout.log_sigma.range()];
+    let advantages = batch.advantages.iter().zip(&batch.modules).flat_map(|(a, n)| std::iter::repeat_n(*a, *n));
+    let actions = batch.actions.chunks_exact(outputs).zip(means.chunks_exact(outputs));
+    let rows = actions.zip(of_means.chunks_exact_mut(outputs)).zip(advantages);
+    for ((((actions, means), of_means), advantage), (weight, old)) in
+        rows.zip(batch.weights.iter().zip(&batch.log_probabilities))
+    {
+        of_means.fill(0.0);
+        if *weight == 0.0 {
+            continue;
+        }
+        let mut log_ratio = -constant - old;
+        for i in 0..outputs {
+            // Kept where the gradient will be: (action - mean) / sigma.
+            of_means[i] = (actions[i] - means[i]) * (-log_sigma[i]).exp();
+            log_ratio -= 0.5 * of_means[i] * of_means[i];
+        }
+        let exact = f64::from(log_ratio).exp();
+        let ratio = exact as f32;
+        let (gain, clipped) = (ratio * advantage, ratio.clamp(1.0 - loss.clip, 1.0 + loss.clip) * advantage);
+        sum.loss -= f64::from(gain.min(clipped) * weight);
+        sum.kl += f64::from(*weight) * (exact - 1.0 - f64::from(log_ratio));
+        if (exact - 1.0).abs() > f64::from(loss.clip) {
+            sum.clipped += f64::from(*weight);
+        }
+        // Where the clip holds the gain down, nothing is gained by moving.
+        let of_log_ratio = if gain <= clipped { -weight * gain } else { 0.0 };
+        for i in 0..outputs {
+            let distance = of_means[i];
+            of_log_sigma[i] += of_log_ratio * (distance * distance - 1.0);
+            of_means[i] = of_log_ratio * distance * (-log_sigma[i]).exp();
+        }
+    }
+}
+
+vectorise! {
+    /// Attention of every module over those of its team that it hears: `latent` is `[rows, LATENT]`; its weights go into `attention`, what
+    /// they gather into `context`, `[rows, VALUE]`.
+    fn attend(latent: &[f32], heard: &[u64], modules: &[usize], attention: &mut [f32], context: &mut [f32]) = attend_body
+}
+
+#[inline(always)]
+fn attend_body<V: Vector>(
+    latent: &[f32],
+    heard: &[u64],
+    modules: &[usize],
+    attention: &mut [f32],
+    context: &mut [f32],
+) {
+    let (latent, context) = (latent.as_chunks::<LATENT>().0, context.as_chunks_mut::<VALUE>().0);
+    let scale = (KEY as f32).sqrt().recip();
+    let (mut first, mut at) = (0, 0);
+    for n in modules {
+        let team = &latent[first..first + n];
+        for i in 0..*n {
+            let weights = &mut attention[at + i * n..at + (i + 1) * n];
+            let query = &team[i][..KEY];
+            let mut largest = f32::NEG_INFINITY;
+            for (j, (weight, other)) in weights.iter_mut().zip(team).enumerate() {
+                let audible = heard[first + i] >> j & 1 == 1;
+                *weight = if audible { dot::<V>(query, &other[KEY..2 * KEY]) * scale } else { f32::NEG_INFINITY };
+                largest = largest.max(*weight);
+            }
+            let mut total = 0.0;
+            for weight in weights.iter_mut() {
+                *weight = (*weight - largest).exp();
+                total += *weight;
+            }
+            let mut sum = [0.0; VALUE];
+            for (weight, other) in weights.iter_mut().zip(team) {
+                *weight /= total;
+                let value = &other[2 * KEY..];
+                for k in 0..VALUE {
+                    sum[k] = V::scalar(*weight, value[k], sum[k]);
+                }
+            }
+            context[first + i] = sum;
+        }
+        (first, at) = (first + n, at + n * n);
+    }
+}
+
+vectorise! {
+    /// The way back of [`attend`]: from the gradient of what was gathered to that of the latents.
+    fn attend_backward(
+        latent: &[f32], heard: &[u64], modules: &[usize], attention: &[f32], of_context: &[f32], of_latent: &mut [f32]
+    ) = attend_backward_body
+}
+
+#[inline(always)]
+fn attend_backward_body<V: Vector>(
+    latent: &[f32],
+    heard: &[u64],
+    modules: &[usize],
+    attention: &[f32],
+    of_context: &[f32],
+    of_latent: &mut [f32],
+) {
+    let (latent, of_context) = (latent.as_chunks::<LATENT>().0, of_context.as_chunks::<VALUE>().0);
+    let of_latent = of_latent.as_chunks_mut::<LATENT>().0;
+    let scale = (KEY as f32).sqrt().recip();
+    let (mut first, mut at) = (0, 0);
+    for n in modules {
+        let (team, of_team) = (&latent[first..first + n], &mut of_latent[first..first + n]);
+        of_team.fill([0.0; LATENT]);
+        for i in 0..*n {
+            let weights = &attention[at + i * n..at + (i + 1) * n];
+            let (query, of_context) = (&team[i][..KEY], &of_context[first + i]);
+            let mut of_weights = [0.0f32; u64::BITS as usize];
+            let mut mean = 0.0;
+            for (j, other) in team.iter().enumerate() {
+                if heard[first + i] >> j & 1 == 1 {
+                    of_weights[j] = dot::<V>(of_context, &other[2 * KEY..]);
+                    mean = V::scalar(weights[j], of_weights[j], mean);
+                    let of_value = &mut of_team[j][2 * KEY..];
+                    for k in 0..VALUE {
+                        of_value[k] = V::scalar(weights[j], of_context[k], of_value[k]);
+                    }
+                }
+            }
+            let mut of_query = [0.0; KEY];
+            for (j, other) in team.iter().enumerate() {
+                if heard[first + i] >> j & 1 == 1 {
+                    let of_score = scale * weights[j] * (of_weights[j] - mean);
+                    let (key, of_key) = (&other[KEY..2 * KEY], &mut of_team[j][KEY..2 * KEY]);
+                    for k in 0..KEY {
+                        of_query[k] = V::scalar(of_score, key[k], of_query[k]);
+                        of_key[k] = V::scalar(of_score, query[k], of_key[k]);
+                    }
+                }
+            }
+            of_team[i][..KEY].copy_from_slice(&of_query);
+        }
+        (first, at) = (first + n, at + n * n);
+    }
+}
