@@ -13,6 +13,7 @@ use composer_shared::policy::{GoalKnownTo, Task};
 use composer_shared::robot::Limits;
 use composer_shared::wire;
 use composer_sim_bridge::faults::{Fault, FaultKind, ScheduledFault};
+use composer_sim_bridge::sensor_model::SensorModel;
 use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -88,6 +89,10 @@ pub struct EnvConfig {
     pub delay: [usize; 2],
     /// Faults drawn in training.
     pub faults: FaultTraining,
+    /// What the modules take the time constant for with which joints without torque straighten, s; none: the robot's own.
+    pub relax_seconds: Option<f32>,
+    /// The modules' sensors; what differs from module to module is drawn for each episode.
+    pub sensors: SensorModel,
 }
 
 impl EnvConfig {
@@ -100,7 +105,29 @@ impl EnvConfig {
             control_period: 0.05,
             delay: [1, 1],
             faults: FaultTraining::default(),
+            relax_seconds: None,
+            sensors: SensorModel::default(),
         }
+    }
+
+    /// The same with the physics step divided by `times`. Control period, delay in seconds, sensors and slew stay as they are, and so do the
+    /// episodes: what comes out differently is the error of the coarser step.
+    pub fn finer(mut self, times: usize) -> Self {
+        self.robot.physics_step /= times as f32;
+        self.delay = self.delay.map(|steps| steps * times);
+        self
+    }
+
+    /// The start of the episode with this seed: the snake in its scene with its sensors, and the judge.
+    pub fn start(&self, seed: u64) -> (Snake, Judge) {
+        let (mut snake, judge) = Judge::start(&self.task, seed, &self.robot);
+        snake.fit_sensors(&self.sensors, seed);
+        (snake, judge)
+    }
+
+    /// Control steps before an episode is cut.
+    pub fn cap(&self) -> u32 {
+        self.task.settings.cap_for(self.robot.modules)
     }
 
     /// Physics steps in one control step.
@@ -170,11 +197,14 @@ pub struct SnakeEnv {
 impl SnakeEnv {
     /// An environment, reset with seed 0.
     pub fn new(config: Arc<EnvConfig>) -> Self {
-        let (snake, judge) = Judge::start(&config.task, 0, &config.robot);
+        let (snake, judge) = config.start(0);
         let modules = config.robot.modules;
         let mut env = SnakeEnv {
             limits: config.robot.limits(),
-            relax: relax_factor((config.control_period * 1e6).round() as u32, config.robot.relax_seconds()),
+            relax: relax_factor(
+                (config.control_period * 1e6).round() as u32,
+                config.relax_seconds.unwrap_or_else(|| config.robot.relax_seconds()),
+            ),
             judge,
             faults: Vec::new(),
             now: FaultsNow::default(),
@@ -195,7 +225,7 @@ impl SnakeEnv {
     /// Starts an episode with given faults instead of drawn ones.
     pub fn reset_with(&mut self, seed: u64, faults: &[ScheduledFault]) {
         let config = self.config.clone();
-        (self.snake, self.judge) = Judge::start(&config.task, seed, &config.robot);
+        (self.snake, self.judge) = config.start(seed);
         self.rng = ChaCha8Rng::seed_from_u64(seed ^ 0x5eed_fa17);
         self.faults = faults.to_vec();
         self.delay = self.rng.random_range(config.delay[0]..=config.delay[1]).min(config.substeps() - 1);
@@ -351,7 +381,7 @@ impl Environment for SnakeEnv {
         Outcome {
             reward,
             terminated: success,
-            truncated: !success && steps >= self.config.task.settings.cap,
+            truncated: !success && steps >= self.config.cap(),
             success,
             distance,
             steps,
@@ -505,6 +535,26 @@ mod tests {
             if task.task() == Task::GoalReaching {
                 assert!((left(&here) - left(&there) - 0.5).abs() < 1e-3);
             }
+        }
+    }
+
+    #[test]
+    fn a_finer_step_changes_neither_the_episode_nor_when_a_torque_acts() {
+        let config = EnvConfig { delay: [1, 3], ..EnvConfig::new(Task::BlockPushing, Robot::default()) };
+        let fine = config.clone().finer(4);
+        assert_eq!((config.substeps(), fine.substeps(), fine.delay), (5, 20, [4, 12]));
+        assert_eq!(config.clone().finer(1), config);
+        let (mut coarse, mut fine) = (SnakeEnv::new(Arc::new(config)), SnakeEnv::new(Arc::new(fine)));
+        coarse.reset_with(5, &[]);
+        fine.reset_with(5, &[]);
+        assert_eq!(coarse.judge().course(), fine.judge().course());
+        drive(&mut coarse, 3);
+        drive(&mut fine, 3);
+        for module in 0..8 {
+            assert_eq!(coarse.command[module], fine.command[module], "slew is per control period");
+            assert!(
+                crate::tasks::distance(coarse.snake.module_position(module), fine.snake.module_position(module)) < 0.2
+            );
         }
     }
 

@@ -1,4 +1,7 @@
 //! Evaluation: whole episodes on seeds that training never draws, without exploration noise.
+//!
+//! An evaluation is easier than the training ([`crate::run::RunConfig::evaluation`]): the torque takes effect after the least delay of those trained
+//! with, no latent is missed, the snake has the robot's own length, and without `--fault` nothing is broken.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -14,6 +17,7 @@ use crate::environment::{Environment, View};
 use crate::methods::mix;
 use crate::network::Network;
 use crate::sim::{Motion, Snake};
+use crate::stats::wilson;
 use crate::tasks::Judge;
 use crate::tasks::goal_reaching::Bearing;
 
@@ -82,6 +86,21 @@ pub fn episode_seed(seed: u64, index: u64) -> u64 {
     mix(mix(seed ^ 0x0e7a_1e7a_1e7a_1e7a) ^ index)
 }
 
+/// Seed of the episodes behind every published figure, and of nothing else: nobody trains, chooses settings or looks on the way by them.
+pub const PUBLISHED_SEED: u64 = 0x9b11_5ed0_0e91_50de;
+/// Episodes of a published figure, at least.
+pub const PUBLISHED_EPISODES: u64 = 500;
+/// Seed of the episodes that people get who do not choose one.
+pub const DEFAULT_SEED: u64 = 1;
+/// Seed that those of the evaluations during a training are derived from.
+pub const CURVE_SEED: u64 = 0x7a1e;
+
+/// Seed of the evaluations during the training with this seed: each run is looked at on episodes of its own, so that the mean over several runs is
+/// one over as many more episodes.
+pub fn curve_seed(run_seed: u64) -> u64 {
+    mix(CURVE_SEED ^ mix(run_seed))
+}
+
 /// What came of one episode.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Episode {
@@ -123,17 +142,23 @@ pub struct ByBearing {
     pub episodes: usize,
     /// Share of them that reached it.
     pub success_rate: f64,
+    /// Lower end of its 95 % interval (Wilson).
+    pub success_low: f64,
+    /// Upper end.
+    pub success_high: f64,
 }
 
-/// Results over all episodes: the paper's three columns with standard errors, and the motion.
+/// Results over all episodes: the paper's three columns, success with its 95 % interval and the means with their standard errors, and the motion.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Report {
     /// Episodes.
     pub episodes: usize,
     /// Share of successes.
     pub success_rate: f64,
-    /// Its standard error (binomial).
-    pub success_rate_se: f64,
+    /// Lower end of its 95 % interval ([`wilson`]).
+    pub success_low: f64,
+    /// Upper end.
+    pub success_high: f64,
     /// Mean distance at the end, units.
     pub distance_mean: f64,
     /// Its standard error.
@@ -142,8 +167,13 @@ pub struct Report {
     pub steps_mean: f64,
     /// Its standard error.
     pub steps_se: f64,
+    /// The cap: control steps before an episode is cut.
+    pub cap: u32,
     /// Modules of the snake.
     pub modules: usize,
+    /// In what the physics differ from the robot's own, such as `finer=2`; empty if in nothing.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub physics: String,
     /// The faults injected, as on the command line; "none" without.
     pub fault: String,
     /// Success by where the goal lay.
@@ -160,7 +190,7 @@ pub struct Report {
 
 impl Report {
     /// Summarises episodes.
-    pub fn new(episodes: &[Episode], modules: usize, fault: &str) -> Self {
+    pub fn new(episodes: &[Episode], config: &EnvConfig, fault: &str) -> Self {
         let n = episodes.len().max(1) as f64;
         let mean_se = |value: &dyn Fn(&Episode) -> f64| {
             let mean = episodes.iter().map(value).sum::<f64>() / n;
@@ -168,7 +198,8 @@ impl Report {
             (mean, (variance / n).sqrt())
         };
         let max = |value: &dyn Fn(&Episode) -> f32| f64::from(episodes.iter().map(value).fold(0.0, f32::max));
-        let rate = episodes.iter().filter(|e| e.success).count() as f64 / n;
+        let successes = episodes.iter().filter(|e| e.success).count();
+        let (success_low, success_high) = wilson(successes, episodes.len());
         let (distance_mean, distance_se) = mean_se(&|e| f64::from(e.distance));
         let (steps_mean, steps_se) = mean_se(&|e| f64::from(e.steps));
         let total_steps: u64 = episodes.iter().map(|e| u64::from(e.steps)).sum();
@@ -177,19 +208,24 @@ impl Report {
             .into_iter()
             .map(|bearing| {
                 let of: Vec<_> = episodes.iter().filter(|e| e.bearing == bearing).collect();
-                let success = of.iter().filter(|e| e.success).count() as f64;
-                ByBearing { bearing, episodes: of.len(), success_rate: success / of.len().max(1) as f64 }
+                let successes = of.iter().filter(|e| e.success).count();
+                let (success_low, success_high) = wilson(successes, of.len());
+                let success_rate = successes as f64 / of.len().max(1) as f64;
+                ByBearing { bearing, episodes: of.len(), success_rate, success_low, success_high }
             })
             .collect();
         Report {
             episodes: episodes.len(),
-            success_rate: rate,
-            success_rate_se: (rate * (1.0 - rate) / n).sqrt(),
+            success_rate: successes as f64 / n,
+            success_low,
+            success_high,
             distance_mean,
             distance_se,
             steps_mean,
             steps_se,
-            modules,
+            cap: config.cap(),
+            modules: config.robot.modules,
+            physics: String::new(),
             fault: fault.into(),
             by_bearing,
             peak_link_speed: max(&|e| e.motion.peak_link_speed),
@@ -281,7 +317,7 @@ impl Trial<'_> {
             progress();
             episode
         });
-        Report::new(&episodes, self.config.robot.modules, fault)
+        Report::new(&episodes, self.config, fault)
     }
 
     /// Runs the first `count` episodes again and records them.
@@ -310,4 +346,20 @@ impl Trial<'_> {
 /// No faults.
 pub fn healthy(_seed: u64, _modules: usize) -> Vec<ScheduledFault> {
     Vec::new()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::collections::HashSet;
+
+    #[test]
+    fn published_curve_and_default_episodes_are_apart() {
+        const EPISODES: u64 = 10_000;
+        let mut seeds = vec![PUBLISHED_SEED, DEFAULT_SEED, CURVE_SEED];
+        seeds.extend((0..4).map(curve_seed));
+        assert_eq!(seeds.iter().collect::<HashSet<_>>().len(), seeds.len());
+        let episodes = seeds.iter().flat_map(|seed| (0..EPISODES).map(move |index| episode_seed(*seed, index)));
+        assert_eq!(episodes.collect::<HashSet<_>>().len() as u64, seeds.len() as u64 * EPISODES);
+    }
 }

@@ -55,7 +55,7 @@ pub enum FreezeError {
 }
 
 /// Difference between float and integer actions.
-#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Parity {
     /// Root mean square, in fractions of the torque limit.
     pub rms: f32,
@@ -321,6 +321,7 @@ mod tests {
             limits: Limits::default(),
             control_period_us: 50_000,
             relax_seconds: 0.3,
+            task_digest: 7,
         }
     }
 

@@ -18,5 +18,6 @@ pub mod robot;
 pub mod run;
 pub mod sil;
 pub mod sim;
+pub mod stats;
 pub mod tasks;
 pub mod train;

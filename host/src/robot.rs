@@ -81,6 +81,16 @@ pub enum Solver {
     Rapier,
 }
 
+impl Solver {
+    /// Name on the command line and in files.
+    pub fn name(self) -> &'static str {
+        match self {
+            Solver::Direct => "direct",
+            Solver::Rapier => "rapier",
+        }
+    }
+}
+
 impl std::str::FromStr for Solver {
     type Err = String;
 

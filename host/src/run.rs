@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
 use composer_shared::policy::{GoalKnownTo, Meta};
+use composer_sim_bridge::sensor_model::SensorModel;
 use serde::{Deserialize, Serialize};
 
 use crate::env::{EnvConfig, FaultTraining};
@@ -62,7 +63,7 @@ pub struct EnvSettings {
 
 impl Default for EnvSettings {
     fn default() -> Self {
-        EnvSettings { goal_known_to: Knows::All, control_period: 0.05, delay: [1, 2], lengths: Vec::new() }
+        EnvSettings { goal_known_to: Knows::All, control_period: 0.05, delay: [1, 3], lengths: Vec::new() }
     }
 }
 
@@ -88,6 +89,8 @@ pub struct RunConfig {
     pub wall_climbing: WallClimbing,
     /// Faults drawn in training.
     pub faults: FaultTraining,
+    /// The modules' sensors.
+    pub sensors: SensorModel,
     /// The robot.
     pub robot: Robot,
 }
@@ -171,6 +174,7 @@ impl RunConfig {
         for &modules in &self.env.lengths {
             task.validate(&self.robot.with_modules(modules)?).map_err(anyhow::Error::msg)?;
         }
+        self.sensors.check().map_err(|error| anyhow::anyhow!("sensors.{error}"))?;
         let faults = &self.faults;
         if !(0.0..=1.0).contains(&faults.probability) || !(0.0..1.0).contains(&faults.missed_latents) {
             bail!("faults.probability and faults.missed_latents are shares: 0 to 1");
@@ -187,16 +191,19 @@ impl RunConfig {
             [] => self.robot.clone(),
             lengths => self.robot.with_modules(lengths[index % lengths.len()])?,
         };
-        Ok(Arc::new(EnvConfig { robot, faults: self.faults.clone(), ..self.evaluation() }))
+        let faults = self.faults.clone();
+        Ok(Arc::new(EnvConfig { robot, faults, delay: self.env.delay, ..self.evaluation() }))
     }
 
-    /// The environment without the robot's length being varied and without faults: what evaluation starts from.
+    /// The environment that evaluations start from. It is easier than the one of the training: the least delay of those trained with, no missed
+    /// latents, no faults, and the robot's own length.
     pub fn evaluation(&self) -> EnvConfig {
         EnvConfig {
             task: self.task(),
             goal_known_to: self.env.goal_known_to.into(),
             control_period: self.env.control_period,
             delay: [self.env.delay[0]; 2],
+            sensors: self.sensors,
             ..EnvConfig::new(self.task.name, self.robot.clone())
         }
     }
@@ -226,6 +233,7 @@ impl RunConfig {
             limits: self.robot.limits(),
             control_period_us: (self.env.control_period * 1e6).round() as u32,
             relax_seconds: self.robot.relax_seconds(),
+            task_digest: self.task().digest(),
         }
     }
 }

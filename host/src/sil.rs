@@ -31,7 +31,7 @@ pub struct SnakePlant {
 impl SnakePlant {
     /// The start of the episode with this seed, the same as [`crate::env::SnakeEnv`]'s.
     pub fn new(config: Arc<EnvConfig>, seed: u64) -> Self {
-        let (snake, judge) = Judge::start(&config.task, seed, &config.robot);
+        let (snake, judge) = config.start(seed);
         let torques = vec![[0; AXES]; config.robot.modules];
         SnakePlant { config, snake, external: None, judge, physics_steps: 0, torques, trace: None }
     }
@@ -39,7 +39,9 @@ impl SnakePlant {
     /// The same episode, of a plant elsewhere.
     pub fn elsewhere(config: Arc<EnvConfig>, seed: u64, elsewhere: &Elsewhere) -> Result<Self, PlantError> {
         let plant = SnakePlant::new(config, seed);
-        let (external, snake) = External::start(elsewhere, &plant.config.robot, &plant.judge.course().scene, seed)?;
+        let scene = &plant.judge.course().scene;
+        let (external, mut snake) = External::start(elsewhere, &plant.config.robot, scene, seed)?;
+        snake.fit_sensors(&plant.config.sensors, seed);
         Ok(SnakePlant { snake, external: Some(external), ..plant })
     }
 
@@ -120,7 +122,6 @@ impl Plant for SnakePlant {
     }
 
     fn done(&self) -> bool {
-        let over = self.judge.verdict().success || self.judge.steps() >= self.config.task.settings.cap;
-        over || self.trouble().is_some()
+        self.judge.verdict().success || self.judge.steps() >= self.config.cap() || self.trouble().is_some()
     }
 }

@@ -21,7 +21,7 @@ use crate::observation::{self, Observation, POINTS, Seeker};
 use crate::robot::{AXES, Geometry, Limits, MAX_JOINTS, ROOM};
 
 /// Version of the layout that this code reads and writes.
-pub const VERSION: u16 = 2;
+pub const VERSION: u16 = 3;
 /// The first bytes of every image.
 pub const MAGIC: [u8; 8] = *b"COMPOSER";
 
@@ -192,6 +192,9 @@ pub struct Meta {
     /// Time constant with which the joints of a module without torque straighten, in seconds
     /// ([`Chain::miss`](crate::kinematics::Chain::miss)).
     pub relax_seconds: f32,
+    /// Digest of the settings of the task that it was trained for; 0: not known. A module only carries it: whoever evaluates the policy
+    /// can tell whether it does so on the same task.
+    pub task_digest: u32,
 }
 
 impl Meta {
@@ -410,7 +413,8 @@ const LINK_LENGTH_AT: usize = 32;
 const LIMITS_AT: usize = 36;
 const PERIOD_AT: usize = 56;
 const RELAX_AT: usize = 60;
-const MEAN_AT: usize = 64;
+const DIGEST_AT: usize = 64;
+const MEAN_AT: usize = 68;
 const GAIN_AT: usize = MEAN_AT + 4 * OBS;
 const SOFTMAX_AT: usize = GAIN_AT + 4 * OBS;
 const LAYERS_AT: usize = SOFTMAX_AT + 8;
@@ -544,6 +548,7 @@ impl<'a> Policy<'a> {
             },
             control_period_us: u32_at(PERIOD_AT)?,
             relax_seconds: f32_at(RELAX_AT)?,
+            task_digest: u32_at(DIGEST_AT)?,
         };
         if let Err(error) = meta.check() {
             return Some(Err(error));
@@ -624,6 +629,11 @@ impl<'a> Policy<'a> {
     /// Time constant with which the joints of a module without torque straighten, in seconds.
     pub fn relax_seconds(&self) -> f32 {
         self.meta.relax_seconds
+    }
+
+    /// Digest of the settings of the task that it was trained for; 0: not known.
+    pub fn task_digest(&self) -> u32 {
+        self.meta.task_digest
     }
 
     /// CRC-32 of the image.
@@ -817,6 +827,7 @@ impl<'a> ImageWriter<'a> {
         }
         writer.put(PERIOD_AT, &meta.control_period_us.to_le_bytes());
         writer.put(RELAX_AT, &meta.relax_seconds.to_le_bytes());
+        writer.put(DIGEST_AT, &meta.task_digest.to_le_bytes());
         for layer in Layer::ALL {
             writer.put(layer.offset(), &1u32.to_le_bytes());
         }
@@ -909,6 +920,7 @@ pub fn random_image(seed: u32, image: &mut [u8; IMAGE_SIZE]) {
         limits: RANDOM_LIMITS,
         control_period_us: 50_000,
         relax_seconds: 0.25,
+        task_digest: 0,
     };
     // SplitMix64.
     let mut state = u64::from(seed);
@@ -1001,6 +1013,7 @@ mod tests {
             limits: Limits { torque: 1.0, torque_slew: 2.0, joint_angle: 3.0, joint_speed: 4.0, temperature: 5.0 },
             control_period_us: 12_345,
             relax_seconds: 0.5,
+            task_digest: 0x89ab_cdef,
         };
         let mut image = Box::new([0; IMAGE_SIZE]);
         let mut writer = ImageWriter::new(&meta, &mut image);
@@ -1021,8 +1034,8 @@ mod tests {
 
     #[test]
     fn the_layout_is_the_documented_one() {
-        assert_eq!(Layer::ALL.map(Layer::offset), [392, 3468, 4560, 5652, 7832, 12444, 14752]);
-        assert_eq!((IMAGE_SIZE, MEAN_AT, SOFTMAX_AT, CRC_AT), (14904, 64, 384, 14900));
+        assert_eq!(Layer::ALL.map(Layer::offset), [396, 3472, 4564, 5656, 7836, 12448, 14756]);
+        assert_eq!((IMAGE_SIZE, MEAN_AT, SOFTMAX_AT, CRC_AT), (14908, 68, 388, 14904));
         assert_eq!(CRC.checksum(b"123456789"), 0xcbf4_3926);
         let document = include_str!("../policy-format.md");
         for layer in Layer::ALL {
@@ -1049,6 +1062,7 @@ mod tests {
             (LIMITS_AT, "f32 | torque limit"),
             (PERIOD_AT, "u32 | control period"),
             (RELAX_AT, "f32 | relaxation time"),
+            (DIGEST_AT, "u32 | task digest"),
             (MEAN_AT, "f32[40] | mean"),
             (GAIN_AT, "f32[40] | gain"),
             (SOFTMAX_AT, "i32 | softmax multiplier"),
@@ -1087,12 +1101,12 @@ mod tests {
         assert_eq!(said(0, b"ELF"), "this is not a policy image: it does not begin with COMPOSER");
         assert_eq!(
             said(VERSION_AT, &[1]),
-            "the policy image has layout version 1, this build reads version 2: export the policy again"
+            "the policy image has layout version 1, this build reads version 3: export the policy again"
         );
         assert!(
             said(DIMENSIONS_AT + 2, &[128]).contains("dimensions [40, 128, 16, 32, 64, 2], this build runs [40, 64")
         );
-        assert_eq!(said(LENGTH_AT, &[0, 0]), "the policy image says it is 0 bytes long, layout version 2 is 14904");
+        assert_eq!(said(LENGTH_AT, &[0, 0]), "the policy image says it is 0 bytes long, layout version 3 is 14908");
         assert_eq!(said(TASK_AT, &[5]), "the policy image is for task 5, this build knows tasks 0 to 4");
         assert!(said(GOAL_KNOWN_TO_AT, &[2]).contains("2 in field `goal known to`"));
         assert!(said(ATTENTION_AT, &[2]).contains("`attention`"));
@@ -1124,7 +1138,7 @@ mod tests {
             Policy::parse(&image[..]).unwrap_err().to_string().starts_with("the policy image is damaged: its CRC-32")
         );
         let cut = Policy::parse(&image[..9000]).unwrap_err().to_string();
-        assert_eq!(cut, "the policy image is cut short: it has 9000 bytes where 14904 are needed");
+        assert_eq!(cut, "the policy image is cut short: it has 9000 bytes where 14908 are needed");
         let long: Vec<u8> = image.iter().copied().chain([0]).collect();
         assert!(Policy::parse(&long).unwrap_err().to_string().contains("too long"));
     }
@@ -1196,7 +1210,7 @@ mod tests {
             attention.iter().for_each(|x| digest.update(&x.to_le_bytes()));
             action.iter().for_each(|x| digest.update(&x.to_bits().to_le_bytes()));
         }
-        assert_eq!((policy.crc(), digest.finalize()), (3_933_058_065, 3_900_035_348));
+        assert_eq!((policy.crc(), digest.finalize()), (2_627_758_852, 3_900_035_348));
     }
 
     #[test]

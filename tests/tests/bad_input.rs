@@ -131,6 +131,23 @@ fn settings_flags_and_faults_are_checked() {
     refuse(folder.path(), &["sil", "goal-reaching", "--bitrate", "1"], &["bit rate"]);
     refuse(folder.path(), &["sil", "goal-reaching", "--drop", "2"], &["probability"]);
     refuse(folder.path(), &["eval", "goal-reaching", "--episodes", "0"], &["0"]);
+    for verb in ["eval", "sil"] {
+        let run =
+            |more: &[&str], words: &[&str]| refuse(folder.path(), &[&[verb, "goal-reaching"], more].concat(), words);
+        run(&["--finer", "0"], &["--finer", "0 is not in 1..=1000"]);
+        run(&["--tolerance", "0"], &["--tolerance 0", "above zero"]);
+        run(&["--vary", "frictoin=1"], &["`frictoin`", "friction_along", "gravity"]);
+        run(&["--vary", "torque_limit=40"], &["`torque_limit`", "stiffness"]);
+        run(&["--vary", "gravity"], &["KEY=VALUE"]);
+        run(&["--published", "--seed", "3"], &["--published", "--seed"]);
+    }
+    refuse(folder.path(), &["report", "policies", "--configs", "none"], &["none/goal-reaching.toml"]);
+    refuse(folder.path(), &["report", "policies", "--tasks", "dancing"], &["dancing"]);
+    refuse(
+        folder.path(),
+        &["report", "policies", "--configs", concat!(env!("CARGO_MANIFEST_DIR"), "/../host/configs"), "--only-freeze"],
+        &["holds no run of goal-reaching"],
+    );
     refuse(folder.path(), &["export", ".", "-o", "x.policy"], &["config.toml"]);
     refuse(
         folder.path(),

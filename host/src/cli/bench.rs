@@ -12,7 +12,7 @@ use composer_sim_bridge::sil::{self, SilConfig};
 use super::PolicySource;
 use crate::env::{EnvConfig, SnakeEnv};
 use crate::environment::{Environment, Told, Trivial, View};
-use crate::eval::{Pilot, episode_seed, parallel};
+use crate::eval::{DEFAULT_SEED, Pilot, episode_seed, parallel};
 use crate::methods::{Differentiation, Method};
 use crate::robot::Robot;
 use crate::run::RunConfig;
@@ -125,7 +125,7 @@ fn bus(image: &[u8], robot: &Robot, seconds: f64) -> Result<(f64, f64)> {
     let config = Arc::new(EnvConfig::new(Task::GoalReaching, robot.clone()));
     let (start, mut virtual_ns, mut load, mut episodes) = (Instant::now(), 0u64, 0.0, 0u64);
     while start.elapsed().as_secs_f64() < seconds {
-        let mut plant = SnakePlant::new(config.clone(), episode_seed(1, episodes));
+        let mut plant = SnakePlant::new(config.clone(), episode_seed(DEFAULT_SEED, episodes));
         let sil = SilConfig::new(composer_firmware::controller::BusKind::Fd);
         let report = sil::run(&mut plant, image, &sil, None, &mut |_, _| {})?;
         virtual_ns += report.duration_ns;
@@ -185,11 +185,11 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             way.threads
         );
     }
-    if let Ok(PolicySource::Image(image)) = PolicySource::load("goal-reaching") {
+    if let Some(image) = PolicySource::load("goal-reaching")?.image() {
         println!("\ncontrollers on the CAN-FD bus (1M/5M) with physics, one thread");
         println!("{:>8} {:>16} {:>10}", "modules", "times real time", "bus load");
         for modules in LENGTHS {
-            let (factor, load) = bus(&image, &robot.with_modules(modules)?, seconds)?;
+            let (factor, load) = bus(image, &robot.with_modules(modules)?, seconds)?;
             println!("{modules:>8} {factor:>16.1} {:>8.1} %", 100.0 * load);
         }
     }

@@ -10,10 +10,13 @@ use composer_shared::policy::Task;
 use composer_sim_bridge::faults::FaultPlan;
 
 use super::eval::Common;
+use super::physics::Physics;
 use super::sil::{BusOptions, BusReport, BusTrial, REPLAYED, write_replay};
 use super::{PolicySource, task_by_name};
 use crate::env::EnvConfig;
+use crate::eval::DEFAULT_SEED;
 use crate::replay::Episode;
+use crate::stats::with_interval;
 
 /// Arguments of the demonstration.
 #[derive(clap::Args, Clone, Debug)]
@@ -22,7 +25,7 @@ pub struct Arguments {
     #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..=100_000))]
     episodes: u64,
     /// Seed of the episodes
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = DEFAULT_SEED)]
     seed: u64,
     /// The page to look at afterwards
     #[arg(long, value_name = "FILE", default_value = "demonstration.html")]
@@ -75,6 +78,8 @@ impl Shipped {
             robot: None,
             fault,
             seed: arguments.seed,
+            published: false,
+            physics: Physics::default(),
             json: false,
             threads: None,
         };
@@ -114,7 +119,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         }
     }
     write_replay(&first.config, "COMPOSER on the simulated bus", to_replay, "all that ship", &arguments.replay)?;
-    footer(arguments, "an episode of every task with a module unplugged");
+    footer(arguments, first.config.cap(), "an episode of every task with a module unplugged");
     Ok(())
 }
 
@@ -136,21 +141,22 @@ pub fn run_one(one: &OneTask) -> Result<()> {
     }
     let title = format!("{} on the simulated bus", one.task.title());
     write_replay(&policy.config, &title, to_replay, policy.name, &arguments.replay)?;
-    footer(arguments, "the first episodes with a module unplugged");
+    footer(arguments, policy.config.cap(), "the first episodes with a module unplugged");
     Ok(())
 }
 
 fn header() {
     println!(
-        "{:<42} {:>14} {:>14} {:>16} {:>9} {:>10}",
+        "{:<42} {:>17} {:>14} {:>16} {:>9} {:>10}",
         "", "success", "distance/units", "control steps", "bus load", "real time"
     );
 }
 
-fn footer(arguments: &Arguments, shown: &str) {
+fn footer(arguments: &Arguments, cap: u32, shown: &str) {
     println!(
-        "\n{} episodes a row; mean and standard error. {} shows {shown}: open it in any browser.",
+        "\n{} episodes a row; success with its 95 % interval (Wilson), the others with their standard error; at most {} control steps. {} shows {shown}: open it in any browser.",
         arguments.episodes,
+        cap,
         arguments.replay.display()
     );
 }
@@ -158,9 +164,8 @@ fn footer(arguments: &Arguments, shown: &str) {
 fn row(label: &str, report: &BusReport) -> String {
     let task = &report.task;
     format!(
-        "{label:<42} {:>6.2} +- {:.2} {:>6.2} +- {:.2} {:>7.1} +- {:<4.1} {:>7.1} % {:>8.0} x",
-        task.success_rate,
-        task.success_rate_se,
+        "{label:<42} {:>17} {:>6.2} +- {:.2} {:>7.1} +- {:<4.1} {:>7.1} % {:>8.0} x",
+        with_interval(task.success_rate, task.success_low, task.success_high, 2),
         task.distance_mean,
         task.distance_se,
         task.steps_mean,

@@ -7,13 +7,15 @@ use anyhow::{Result, bail};
 use composer_shared::policy::Task;
 use indicatif::{ProgressBar, ProgressStyle};
 
+use super::physics::Physics;
 use super::sil::{REPLAYED, write_replay};
 use super::{PolicySource, task_by_name};
 use composer_sim_bridge::faults::{FaultPlan, ScheduledFault};
 
-use crate::env::knows_fault;
-use crate::eval::{Report, Trial};
+use crate::env::{EnvConfig, knows_fault};
+use crate::eval::{DEFAULT_SEED, PUBLISHED_EPISODES, PUBLISHED_SEED, Report, Trial};
 use crate::robot::Robot;
+use crate::stats::with_interval;
 
 /// What to evaluate and how; `sil` takes the same.
 #[derive(clap::Args, Clone, Debug)]
@@ -36,8 +38,13 @@ pub struct Common {
     #[arg(long, default_value = "none")]
     pub fault: FaultPlan,
     /// Seed of the episodes; training never draws the same ones
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = DEFAULT_SEED)]
     pub seed: u64,
+    /// The episodes behind the published figures, instead of --seed and --episodes
+    #[arg(long, conflicts_with_all = ["seed", "episodes"])]
+    pub published: bool,
+    #[command(flatten)]
+    pub physics: Physics,
     /// Print one JSON object and nothing else
     #[arg(long)]
     pub json: bool,
@@ -56,6 +63,21 @@ impl Common {
         }
     }
 
+    /// How many episodes.
+    pub fn episodes(&self) -> u64 {
+        if self.published { PUBLISHED_EPISODES } else { self.episodes }
+    }
+
+    /// Their seed.
+    pub fn seed(&self) -> u64 {
+        if self.published { PUBLISHED_SEED } else { self.seed }
+    }
+
+    /// The environment of a policy with everything that was asked for.
+    pub fn environment(&self, source: &PolicySource) -> Result<EnvConfig> {
+        self.physics.apply(source.environment(self.task, self.robot()?.as_ref())?)
+    }
+
     /// Faults of an episode.
     pub fn draw(&self) -> impl Fn(u64, usize) -> Vec<ScheduledFault> + Sync {
         |seed, modules| self.fault.draw(seed, modules)
@@ -63,7 +85,7 @@ impl Common {
 
     /// A progress bar over the episodes, hidden when nobody looks.
     pub fn bar(&self) -> ProgressBar {
-        let bar = if self.json { ProgressBar::hidden() } else { ProgressBar::new(self.episodes) };
+        let bar = if self.json { ProgressBar::hidden() } else { ProgressBar::new(self.episodes()) };
         if let Ok(style) = ProgressStyle::with_template("{msg} [{bar:40}] {pos}/{len} episodes, {eta} left") {
             bar.set_style(style);
         }
@@ -86,7 +108,7 @@ pub struct Arguments {
 pub fn run(arguments: &Arguments) -> Result<()> {
     let common = &arguments.common;
     let source = PolicySource::load(&common.policy)?;
-    let config = Arc::new(source.environment(common.task, common.robot()?.as_ref())?);
+    let config = Arc::new(common.environment(&source)?);
     common.fault.check(config.robot.modules)?;
     if let Some(fault) = common.fault.faults.iter().find(|fault| !knows_fault(&fault.kind)) {
         bail!("{fault} happens on a bus: `snakectl sil` has one; eval knows action, observation, unplug and cut");
@@ -95,12 +117,13 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let draw = common.draw();
     let trial = Trial {
         config: &config,
-        episodes: common.episodes as usize,
-        seed: common.seed,
+        episodes: common.episodes() as usize,
+        seed: common.seed(),
         faults: &draw,
         threads: common.threads.unwrap_or_else(super::cores),
     };
-    let report = trial.evaluate(source.pilot()?, &common.fault.to_string(), &|| bar.inc(1));
+    let mut report = trial.evaluate(source.pilot()?, &common.fault.to_string(), &|| bar.inc(1));
+    report.physics = common.physics.to_string();
     bar.finish_and_clear();
     if let Some(path) = &arguments.replay {
         let title = format!("{} in the simulator", config.task.task().title());
@@ -117,24 +140,29 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     Ok(())
 }
 
-/// The report for people: the paper's three columns, success by bearing, and the motion.
+/// The report for people: the paper's three columns, success (with its 95 % interval) by bearing, and the motion.
 pub fn table(report: &Report) -> String {
     let mut text = format!(
-        "{} episodes, {} modules, fault {}\n  success   {:.3} +- {:.3}\n  distance  {:.2} +- {:.2} units\n  steps     {:.1} +- {:.1}\n  ",
+        "{} episodes, {} modules, fault {}{}\n  success   {}\n  distance  {:.2} +- {:.2} units\n  steps     {:.1} +- {:.1}, at most {}\n  ",
         report.episodes,
         report.modules,
         report.fault,
-        report.success_rate,
-        report.success_rate_se,
+        if report.physics.is_empty() { String::new() } else { format!(", {}", report.physics) },
+        with_interval(report.success_rate, report.success_low, report.success_high, 3),
         report.distance_mean,
         report.distance_se,
         report.steps_mean,
-        report.steps_se
+        report.steps_se,
+        report.cap
     );
     let bearings: Vec<_> = report
         .by_bearing
         .iter()
-        .map(|b| format!("{:?} {:.2} ({})", b.bearing, b.success_rate, b.episodes).to_lowercase())
+        .filter(|b| b.episodes > 0)
+        .map(|b| {
+            let success = with_interval(b.success_rate, b.success_low, b.success_high, 2);
+            format!("{:?} {success} of {}", b.bearing, b.episodes).to_lowercase()
+        })
         .collect();
     text += &bearings.join("  ");
     text += &format!(

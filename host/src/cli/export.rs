@@ -1,4 +1,4 @@
-//! `snakectl export`: from a training run to a policy image, its manifest, and the metrics of its run.
+//! `snakectl export`: from a training run to a policy image, its manifest, and the metrics of its run. `report policies` does the same with several runs.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -6,17 +6,22 @@ use std::sync::Arc;
 use anyhow::{Context, Result};
 use composer_shared::policy::Policy;
 use composer_sim_bridge::faults::FaultPlan;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::policy_file::load_run;
-use crate::eval::{Pilot, Report, Trial, healthy};
+use crate::env::EnvConfig;
+use crate::eval::{PUBLISHED_EPISODES, PUBLISHED_SEED, Pilot, Report, Trial, healthy};
 use crate::files::write_whole;
 use crate::freeze::{Parity, freeze, parity};
 use crate::run::RunConfig;
+use crate::stats::with_interval;
 
 /// Seeds of the episodes that scales are taken from, and of those that parity is measured on.
 const CALIBRATION_SEED: u64 = 0xca11;
 const HELD_OUT_SEED: u64 = 0x4e1d;
+
+/// Episodes that scales are taken from, and as many others that parity is measured on.
+pub(super) const CALIBRATION_EPISODES: u64 = 24;
 
 /// Arguments of `export`.
 #[derive(clap::Args, Clone, Debug)]
@@ -27,21 +32,20 @@ pub struct Arguments {
     #[arg(short, long, value_name = "FILE")]
     out: PathBuf,
     /// Episodes that scales are taken from, and as many others that parity is measured on
-    #[arg(long, default_value_t = 24, value_parser = clap::value_parser!(u64).range(1..=10_000))]
+    #[arg(long, default_value_t = CALIBRATION_EPISODES, value_parser = clap::value_parser!(u64).range(1..=10_000))]
     episodes: u64,
-    /// Episodes for each figure of the manifest
-    #[arg(long, default_value_t = 200, value_parser = clap::value_parser!(u64).range(1..=100_000))]
+    /// Episodes for each figure of the manifest, the first of the published ones (`snakectl eval --published`)
+    #[arg(long, default_value_t = PUBLISHED_EPISODES, value_parser = clap::value_parser!(u64).range(1..=100_000))]
     measured_episodes: u64,
 }
 
-/// Seed of the manifest's figures, the default of `eval`.
-const MANIFEST_SEED: u64 = 1;
-
 /// What is written beside an image: where it comes from and what it can do.
 #[derive(Serialize)]
-struct Manifest {
+pub(super) struct Manifest {
     task: &'static str,
     image_bytes: usize,
+    /// Digest of the task's settings, as the image has it.
+    task_digest: String,
     crc32: String,
     /// Version control's name of the state that trained or at least froze it; "unknown" outside a repository.
     commit: String,
@@ -50,26 +54,137 @@ struct Manifest {
     wall_seconds: f64,
     parity: Parity,
     measured: Vec<Measured>,
+    /// The same of all seeds that it was chosen from, if it was: that of the median success.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    seeds: Vec<SeedRows>,
     run: RunConfig,
 }
 
-/// One row of measured success: the integer policy in the simulator (`snakectl eval`).
-#[derive(Serialize)]
-struct Measured {
-    fault: String,
-    modules: usize,
-    episodes: usize,
-    success_rate: f64,
-    success_rate_se: f64,
-    steps_mean: f64,
+/// What a policy of one of several seeds can do.
+#[derive(Clone, Serialize)]
+pub(super) struct SeedRows {
+    /// Seed of the run.
+    pub seed: u64,
+    /// Its rows.
+    pub measured: Vec<Measured>,
 }
 
-fn measure(trial: &Trial, policy: Policy, modules: usize, fault: &str) -> Result<Report> {
+/// One row of measured success: the integer policy in the simulator (`snakectl eval --published`). It is easier there than in training:
+/// [`RunConfig::evaluation`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct Measured {
+    /// The faults injected.
+    pub fault: String,
+    /// Modules of the snake.
+    pub modules: usize,
+    /// Episodes.
+    pub episodes: usize,
+    /// Share of successes.
+    pub success_rate: f64,
+    /// Lower end of its 95 % interval (Wilson).
+    pub success_low: f64,
+    /// Upper end.
+    pub success_high: f64,
+    /// Mean number of control steps.
+    pub steps_mean: f64,
+    /// Control steps before an episode is cut.
+    pub cap: u32,
+}
+
+impl From<Report> for Measured {
+    fn from(report: Report) -> Self {
+        Measured {
+            fault: report.fault,
+            modules: report.modules,
+            episodes: report.episodes,
+            success_rate: report.success_rate,
+            success_low: report.success_low,
+            success_high: report.success_high,
+            steps_mean: report.steps_mean,
+            cap: report.cap,
+        }
+    }
+}
+
+/// The rows that are measured of a policy that was trained on `own` modules: faults, then lengths.
+pub(super) fn rows(own: usize) -> Vec<(usize, &'static str)> {
+    let faults = ["none", "unplug:1", "unplug:2", "action:1", "action:2", "observation:1"];
+    let lengths = [9, 10, 11, 16].map(|modules| (modules, "none"));
+    faults.map(|fault| (own, fault)).into_iter().chain(lengths).collect()
+}
+
+/// Measures one row on the published episodes.
+pub(super) fn measure(
+    config: &EnvConfig,
+    image: &[u8],
+    (modules, fault): (usize, &str),
+    episodes: u64,
+    threads: usize,
+) -> Result<Measured> {
+    let policy = Policy::parse(image).map_err(|e| anyhow::anyhow!("{e}"))?;
     let plan: FaultPlan = fault.parse().with_context(|| format!("the fault {fault}"))?;
     let draw = |seed, modules| plan.draw(seed, modules);
-    let robot = trial.config.robot.with_modules(modules)?;
-    let config = Arc::new(crate::env::EnvConfig { robot, ..(**trial.config).clone() });
-    Ok(Trial { config: &config, faults: &draw, ..*trial }.evaluate(Pilot::Integer(policy), fault, &|| {}))
+    let config = Arc::new(EnvConfig { robot: config.robot.with_modules(modules)?, ..config.clone() });
+    let trial = Trial { config: &config, episodes: episodes as usize, seed: PUBLISHED_SEED, faults: &draw, threads };
+    Ok(trial.evaluate(Pilot::Integer(policy), fault, &|| {}).into())
+}
+
+/// Freezes the network of a run folder, with scales of `episodes` episodes; the difference of float and integer actions is that of as many others.
+pub(super) fn freeze_run(folder: &Path, episodes: u64, threads: usize) -> Result<(RunConfig, Vec<u8>, Parity)> {
+    let (config, network) = load_run(folder)?;
+    let env = Arc::new(config.evaluation());
+    let draw = |seed, modules| config.faults.draw(seed, modules);
+    let trial = Trial {
+        config: &env,
+        episodes: episodes as usize,
+        seed: CALIBRATION_SEED,
+        faults: if config.faults.probability > 0.0 { &draw } else { &healthy },
+        threads,
+    };
+    let image = freeze(&network, &config.meta(), &trial.observations(&network))?;
+    let policy = Policy::parse(&image).map_err(|e| anyhow::anyhow!("the frozen image is refused: {e}"))?;
+    let held_out = Trial { seed: HELD_OUT_SEED, ..trial }.observations(&network);
+    let parity = parity(&network, &policy, &held_out);
+    Ok((config, image, parity))
+}
+
+/// A frozen policy with what is known of it.
+pub(super) struct Exported<'a> {
+    /// The settings of its run.
+    pub config: RunConfig,
+    /// Folder of the run.
+    pub run: &'a Path,
+    /// The image.
+    pub image: &'a [u8],
+    /// Floats against integers.
+    pub parity: Parity,
+    /// Its rows.
+    pub measured: Vec<Measured>,
+    /// Those of all seeds that it was chosen from.
+    pub seeds: Vec<SeedRows>,
+}
+
+impl Exported<'_> {
+    /// Writes image, manifest and metrics side by side.
+    pub fn write(self, out: &Path, metrics: &[u8]) -> Result<()> {
+        let policy = Policy::parse(self.image).map_err(|e| anyhow::anyhow!("{e}"))?;
+        let manifest = Manifest {
+            task: policy.task().name(),
+            image_bytes: self.image.len(),
+            task_digest: format!("{:08x}", policy.task_digest()),
+            crc32: format!("{:08x}", policy.crc()),
+            commit: commit(),
+            trained_with_faults: policy.trained_with_faults(),
+            wall_seconds: wall_seconds(self.run),
+            parity: self.parity,
+            measured: self.measured,
+            seeds: self.seeds,
+            run: self.config,
+        };
+        write_whole(out, self.image)?;
+        write_whole(&out.with_extension("toml"), toml::to_string(&manifest)?.as_bytes())?;
+        write_whole(&out.with_extension("metrics.jsonl"), metrics)
+    }
 }
 
 fn commit() -> String {
@@ -82,7 +197,7 @@ fn commit() -> String {
 }
 
 /// Wall time that the last line of a run's metrics tells.
-fn wall_seconds(run: &Path) -> f64 {
+pub(super) fn wall_seconds(run: &Path) -> f64 {
     let text = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default();
     let last = text.lines().last().and_then(|line| serde_json::from_str::<serde_json::Value>(line).ok());
     last.and_then(|line| line["time/wall_seconds"].as_f64()).unwrap_or(0.0)
@@ -90,64 +205,28 @@ fn wall_seconds(run: &Path) -> f64 {
 
 /// Runs the verb.
 pub fn run(arguments: &Arguments) -> Result<()> {
-    let (config, network) = load_run(&arguments.run)?;
-    let env = Arc::new(config.evaluation());
-    let draw = |seed, modules| config.faults.draw(seed, modules);
-    let trial = Trial {
-        config: &env,
-        episodes: arguments.episodes as usize,
-        seed: CALIBRATION_SEED,
-        faults: if config.faults.probability > 0.0 { &draw } else { &healthy },
-        threads: super::cores(),
-    };
-    let image = freeze(&network, &config.meta(), &trial.observations(&network))?;
-    let policy = Policy::parse(&image).map_err(|e| anyhow::anyhow!("the frozen image is refused: {e}"))?;
-    let held_out = Trial { seed: HELD_OUT_SEED, ..trial }.observations(&network);
-    let parity = parity(&network, &policy, &held_out);
-    let mut measured = Vec::new();
-    let measuring = Trial {
-        config: &env,
-        episodes: arguments.measured_episodes as usize,
-        seed: MANIFEST_SEED,
-        faults: &healthy,
-        threads: super::cores(),
-    };
-    let own = config.robot.modules;
-    let faults = ["none", "unplug:1", "unplug:2", "action:1", "action:2", "observation:1"];
-    let lengths = [9, 10, 11, 16].map(|modules| (modules, "none"));
-    for (modules, fault) in faults.map(|fault| (own, fault)).into_iter().chain(lengths) {
-        let report = measure(&measuring, policy, modules, fault)?;
-        measured.push(Measured {
-            fault: report.fault,
-            modules,
-            episodes: report.episodes,
-            success_rate: report.success_rate,
-            success_rate_se: report.success_rate_se,
-            steps_mean: report.steps_mean,
-        });
-    }
-    let manifest = Manifest {
-        task: policy.task().name(),
-        image_bytes: image.len(),
-        crc32: format!("{:08x}", policy.crc()),
-        commit: commit(),
-        trained_with_faults: policy.trained_with_faults(),
-        wall_seconds: wall_seconds(&arguments.run),
-        parity,
-        measured,
-        run: config.clone(),
-    };
+    let threads = super::cores();
+    let (config, image, parity) = freeze_run(&arguments.run, arguments.episodes, threads)?;
+    let env = config.evaluation();
+    let measured = rows(config.robot.modules)
+        .into_iter()
+        .map(|row| measure(&env, &image, row, arguments.measured_episodes, threads))
+        .collect::<Result<Vec<_>>>()?;
     let metrics = std::fs::read(arguments.run.join("metrics.jsonl"))
         .with_context(|| format!("cannot read the metrics of {}", arguments.run.display()))?;
-    write_whole(&arguments.out, &image)?;
-    write_whole(&arguments.out.with_extension("toml"), toml::to_string(&manifest)?.as_bytes())?;
-    write_whole(&arguments.out.with_extension("metrics.jsonl"), &metrics)?;
-    for m in &manifest.measured {
+    for m in &measured {
         println!(
-            "{:>2} modules, {:<14} success {:.3} +- {:.3}, {:.1} steps",
-            m.modules, m.fault, m.success_rate, m.success_rate_se, m.steps_mean
+            "{:>2} modules, {:<14} success {}, {:.1} steps of at most {}",
+            m.modules,
+            m.fault,
+            with_interval(m.success_rate, m.success_low, m.success_high, 3),
+            m.steps_mean,
+            m.cap
         );
     }
+    let exported = Exported { config, run: &arguments.run, image: &image, parity, measured, seeds: Vec::new() };
+    exported.write(&arguments.out, &metrics)?;
+    let policy = Policy::parse(&image).map_err(|e| anyhow::anyhow!("{e}"))?;
     println!(
         "{}: {} bytes, CRC-32 {:08x}\nfloat against integer actions on {} held-out samples: rms {:.5}, 99 % within {:.5}, max {:.5} of the torque limit",
         arguments.out.display(),

@@ -61,7 +61,7 @@ enum BusOff {
 /// Runs the verb.
 pub fn run(arguments: &Arguments) -> Result<()> {
     let policy = match PolicySource::load(&arguments.policy)? {
-        PolicySource::Image(image) => image,
+        PolicySource::Image(frozen) => frozen.image,
         _ => bail!("{} is no policy image: freeze a run with `snakectl export` first", arguments.policy),
     };
     let page = node_page(arguments)?;

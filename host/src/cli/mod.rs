@@ -7,6 +7,7 @@ mod eval;
 mod export;
 mod flash;
 mod mjcf;
+mod physics;
 mod policy_file;
 mod report;
 mod sil;

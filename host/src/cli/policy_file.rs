@@ -10,11 +10,94 @@ use crate::eval::Pilot;
 use crate::network::Network;
 use crate::robot::Robot;
 use crate::run::RunConfig;
+use crate::tasks::{AllRules, TaskConfig, TaskSettings};
+
+/// A frozen policy.
+pub struct Frozen {
+    /// Where it comes from, for people.
+    pub name: String,
+    /// The image; it has been checked.
+    pub image: Vec<u8>,
+    /// The task by the manifest beside it, if there is one.
+    pub manifest: Option<TaskConfig>,
+}
+
+impl Frozen {
+    /// The settings of the task to evaluate it on, and what there is to say about that: those that it was trained for if image and manifest agree on
+    /// them, else today's defaults.
+    fn task(&self, policy: &Policy) -> (TaskConfig, Option<String>) {
+        let (name, today, digest) = (&self.name, TaskConfig::new(policy.task()), policy.task_digest());
+        match &self.manifest {
+            Some(own) if own.digest() == digest => {
+                let differences = own.differences(&today);
+                let note = (!differences.is_empty()).then(|| {
+                    format!(
+                        "{name} is evaluated on the task it was trained for, not on today's defaults: {}",
+                        differences.join(", ")
+                    )
+                });
+                (own.clone(), note)
+            }
+            _ if digest == today.digest() => (today, None),
+            Some(own) if digest == 0 => {
+                let differences = today.differences(own);
+                let note = (!differences.is_empty()).then(|| {
+                    format!(
+                        "{name} is evaluated on today's defaults, not on the task of its manifest, which the image does not vouch for: {}",
+                        differences.join(", ")
+                    )
+                });
+                (today, note)
+            }
+            None if digest == 0 => (today, None),
+            _ => {
+                let note = format!(
+                    "{name} is evaluated on today's defaults, but was trained for other settings of the task, and no manifest beside it says which"
+                );
+                (today, Some(note))
+            }
+        }
+    }
+}
+
+/// The task of a manifest: what it is, and its settings in the run that was frozen.
+fn manifest_task(text: &str) -> Result<TaskConfig> {
+    let mut manifest: toml::Table = toml::from_str(text).map_err(|e| anyhow::anyhow!("{}", e.message()))?;
+    let run = manifest.get_mut("run").and_then(toml::Value::as_table_mut).context("it has no [run]")?;
+    // Of the settings, no others than those of the task: a manifest outlives those of the learner.
+    fn section<T: serde::de::DeserializeOwned>(run: &mut toml::Table, name: &str) -> Result<T> {
+        let section = run.remove(name).with_context(|| format!("it has no [run.{name}]"))?;
+        section.try_into().map_err(|e: toml::de::Error| anyhow::anyhow!("[run.{name}]: {}", e.message()))
+    }
+    let settings: TaskSettings = section(run, "task")?;
+    let mut task = TaskConfig { settings, rules: AllRules::default() };
+    let (name, rules) = (task.settings.name.name().replace('-', "_"), &mut task.rules);
+    match task.settings.name {
+        Task::GoalReaching => rules.goal_reaching = section(run, &name)?,
+        Task::BlockPushing => rules.block_pushing = section(run, &name)?,
+        Task::ShapeFormation => rules.shape_formation = section(run, &name)?,
+        Task::TubeCrossing => rules.tube_crossing = section(run, &name)?,
+        Task::WallClimbing => rules.wall_climbing = section(run, &name)?,
+    }
+    Ok(task)
+}
+
+/// The manifest of a policy that ships.
+fn shipped_manifest(name: &str) -> Option<&'static str> {
+    Some(match name {
+        "goal-reaching" => include_str!("../../../shared/policies/goal-reaching.toml"),
+        "block-pushing" => include_str!("../../../shared/policies/block-pushing.toml"),
+        "shape-formation" => include_str!("../../../shared/policies/shape-formation.toml"),
+        "tube-crossing" => include_str!("../../../shared/policies/tube-crossing.toml"),
+        "wall-climbing" => include_str!("../../../shared/policies/wall-climbing.toml"),
+        _ => return None,
+    })
+}
 
 /// A policy to evaluate or to run.
 pub enum PolicySource {
     /// A frozen integer policy image.
-    Image(Vec<u8>),
+    Image(Frozen),
     /// The float network of a training run, with its settings.
     Run(Box<(Network, RunConfig)>),
     /// No policy: baselines.
@@ -34,13 +117,24 @@ impl PolicySource {
         if path.is_file() {
             let image = std::fs::read(path).with_context(|| format!("cannot read {name}"))?;
             Policy::parse(&image).map_err(|e| anyhow::anyhow!("{name} is not a usable policy image: {e}"))?;
-            return Ok(PolicySource::Image(image));
+            let file = path.with_extension("toml");
+            let manifest = match std::fs::read_to_string(&file) {
+                Err(_) => None,
+                Ok(text) => manifest_task(&text)
+                    .inspect_err(|e| eprintln!("note: {} is not used: it is no manifest, {e:#}", file.display()))
+                    .ok(),
+            };
+            return Ok(PolicySource::Image(Frozen { name: name.into(), image, manifest }));
         }
         match name {
             "still" => Ok(PolicySource::Still),
             "random" => Ok(PolicySource::Random),
             _ => match composer_shared::policies::shipped(name) {
-                Some(image) => Ok(PolicySource::Image(image.to_vec())),
+                Some(image) => Ok(PolicySource::Image(Frozen {
+                    name: name.into(),
+                    image: image.to_vec(),
+                    manifest: shipped_manifest(name).map(manifest_task).transpose()?,
+                })),
                 None => bail!(
                     "there is no policy {name}: give an image file, a run folder, still, random, or one that ships ({})",
                     composer_shared::policies::NAMES.join(", ")
@@ -49,10 +143,20 @@ impl PolicySource {
         }
     }
 
+    /// The image, if it is one.
+    pub fn image(&self) -> Option<&[u8]> {
+        match self {
+            PolicySource::Image(frozen) => Some(&frozen.image),
+            _ => None,
+        }
+    }
+
     /// The pilot that flies it. The image has been checked when it was loaded.
     pub fn pilot(&self) -> Result<Pilot<'_>> {
         Ok(match self {
-            PolicySource::Image(image) => Pilot::Integer(Policy::parse(image).map_err(|e| anyhow::anyhow!("{e}"))?),
+            PolicySource::Image(frozen) => {
+                Pilot::Integer(Policy::parse(&frozen.image).map_err(|e| anyhow::anyhow!("{e}"))?)
+            }
             PolicySource::Run(run) => Pilot::Float(&run.0),
             PolicySource::Still => Pilot::Still,
             PolicySource::Random => Pilot::Random,
@@ -62,7 +166,9 @@ impl PolicySource {
     /// The task that the policy was made for; baselines are made for none.
     fn task(&self) -> Result<Option<Task>> {
         Ok(match self {
-            PolicySource::Image(image) => Some(Policy::parse(image).map_err(|e| anyhow::anyhow!("{e}"))?.task()),
+            PolicySource::Image(frozen) => {
+                Some(Policy::parse(&frozen.image).map_err(|e| anyhow::anyhow!("{e}"))?.task())
+            }
             PolicySource::Run(run) => Some(run.1.task.name),
             PolicySource::Still | PolicySource::Random => None,
         })
@@ -83,10 +189,15 @@ impl PolicySource {
 
     fn any_environment(&self, task: Option<Task>, robot: Option<&Robot>) -> Result<EnvConfig> {
         match self {
-            PolicySource::Image(image) => {
-                let policy = Policy::parse(image).map_err(|e| anyhow::anyhow!("{e}"))?;
+            PolicySource::Image(frozen) => {
+                let policy = Policy::parse(&frozen.image).map_err(|e| anyhow::anyhow!("{e}"))?;
                 let mut config = EnvConfig::new(policy.task(), robot.cloned().unwrap_or_default());
                 check(&policy, &config.robot)?;
+                let (task, note) = frozen.task(&policy);
+                if let Some(note) = note {
+                    eprintln!("note: {note}");
+                }
+                config.task = task;
                 config.goal_known_to = policy.goal_known_to();
                 config.control_period = policy.control_period_us() as f32 * 1e-6;
                 Ok(config)
@@ -143,4 +254,90 @@ pub fn load_run(folder: &Path) -> Result<(RunConfig, Network)> {
     let network: Network = serde_json::from_slice(&text).with_context(|| format!("{} is damaged", path.display()))?;
     network.check().with_context(|| format!("{} is damaged", path.display()))?;
     Ok((config, network))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use composer_shared::policies;
+    use composer_shared::policy::{IMAGE_SIZE, ImageWriter, Meta, random_image};
+
+    /// An image that says it was trained for this task.
+    fn image(task: &TaskConfig, digest: u32) -> Vec<u8> {
+        let mut image = [0; IMAGE_SIZE];
+        random_image(1, &mut image);
+        let meta = Policy::parse(&image).unwrap().meta();
+        let limits = Robot::default().limits();
+        let meta = Meta { task: task.task(), task_digest: digest, limits, ..meta };
+        let mut writer = ImageWriter::new(&meta, &mut image);
+        (0..composer_shared::policy::OBS).for_each(|field| writer.input(field, 0.0, 1.0));
+        writer.finish().unwrap();
+        image.to_vec()
+    }
+
+    fn manifest(task: &TaskConfig) -> String {
+        let mut run = RunConfig::default();
+        run.task = task.settings.clone();
+        run.block_pushing = task.rules.block_pushing.clone();
+        let text = toml::to_string(&toml::Table::from_iter([("run".into(), toml::Value::try_from(run).unwrap())]));
+        // A setting of the learner that this version does not know.
+        text.unwrap().replace("[run.train]", "[run.train]\nforgotten = 1")
+    }
+
+    #[test]
+    fn a_policy_is_evaluated_on_the_task_of_its_manifest_if_the_image_vouches_for_it() {
+        let today = TaskConfig::new(Task::BlockPushing);
+        let mut own = today.clone();
+        own.rules.block_pushing.success_distance = 1.5;
+        own.settings.cap = 150;
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("x.policy");
+        let load = |digest: u32, manifest: Option<String>| {
+            std::fs::write(&file, image(&own, digest)).unwrap();
+            let beside = file.with_extension("toml");
+            let _ = std::fs::remove_file(&beside);
+            if let Some(text) = manifest {
+                std::fs::write(&beside, text).unwrap();
+            }
+            let PolicySource::Image(frozen) = PolicySource::load(file.to_str().unwrap()).unwrap() else {
+                unreachable!()
+            };
+            let (task, note) = frozen.task(&Policy::parse(&frozen.image).unwrap());
+            assert_eq!(PolicySource::Image(frozen).environment(None, None).unwrap().task, task);
+            (task, note.unwrap_or_default())
+        };
+        let (task, note) = load(own.digest(), Some(manifest(&own)));
+        assert_eq!(task.judged(), own.judged());
+        assert!(
+            note.contains("success_distance = 1.5 instead of 1.0") && note.contains("cap = 150 instead of 125"),
+            "{note}"
+        );
+        assert_eq!(load(today.digest(), Some(manifest(&today))), (today.clone(), String::new()));
+        assert_eq!(load(today.digest(), None), (today.clone(), String::new()));
+        for (digest, manifest, words) in [
+            // A manifest of another image, one that is none, and none at all.
+            (own.digest(), Some(manifest(&today)), "no manifest beside it"),
+            (own.digest(), Some("x = 1".into()), "no manifest beside it"),
+            (own.digest(), None, "no manifest beside it"),
+            (0, Some(manifest(&own)), "success_distance = 1.0 instead of 1.5"),
+        ] {
+            let (task, note) = load(digest, manifest);
+            assert!(task == today && note.contains(words) && !note.contains('\n'), "{note}");
+        }
+        assert_eq!(load(0, None), (today, String::new()));
+    }
+
+    #[test]
+    fn the_manifest_of_every_policy_that_ships_is_of_its_image() {
+        for name in policies::NAMES {
+            let policy = Policy::parse(policies::shipped(name).unwrap()).unwrap();
+            let text = shipped_manifest(name).unwrap();
+            let table: toml::Table = toml::from_str(text).unwrap();
+            assert_eq!(table["crc32"].as_str(), Some(format!("{:08x}", policy.crc()).as_str()), "{name}");
+            assert_eq!(table["task_digest"].as_str(), Some(format!("{:08x}", policy.task_digest()).as_str()), "{name}");
+            let task = manifest_task(text).unwrap();
+            assert_eq!(task.task(), policy.task());
+            assert!([0, task.digest()].contains(&policy.task_digest()), "{name}");
+        }
+    }
 }

@@ -7,8 +7,10 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
 use composer_firmware::controller::{BusKind, Timing};
+use composer_shared::observation::Sensors;
 use composer_shared::policy::Policy;
 use composer_shared::robot::AXES;
+use composer_sim_bridge::Plant;
 use composer_sim_bridge::computer::{InProcess, Launcher};
 use composer_sim_bridge::external_plant::{self, Address};
 use composer_sim_bridge::faults::{FaultKind, PlannedFault};
@@ -228,6 +230,43 @@ pub struct BusTrial<'a> {
     pub elsewhere: Option<Elsewhere>,
 }
 
+/// The plant as the bus sees it, whose physics take several steps where the bus takes one: sensors are sampled and torques take effect at the same
+/// moments as with the robot's own step, whatever `--finer` says.
+struct Coarse {
+    plant: SnakePlant,
+    times: usize,
+}
+
+impl Plant for Coarse {
+    fn modules(&self) -> usize {
+        self.plant.modules()
+    }
+
+    fn step_ns(&self) -> u64 {
+        (f64::from(self.plant.config().robot.physics_step) * self.times as f64 * 1e9).round() as u64
+    }
+
+    fn sensors(&self, module: usize) -> Sensors {
+        self.plant.sensors(module)
+    }
+
+    fn point(&self, number: u8) -> Option<[f32; 3]> {
+        self.plant.point(number)
+    }
+
+    fn set_torque(&mut self, module: usize, torque: [f32; AXES]) {
+        self.plant.set_torque(module, torque);
+    }
+
+    fn step(&mut self) {
+        (0..self.times).for_each(|_| self.plant.step());
+    }
+
+    fn done(&self) -> bool {
+        self.plant.done()
+    }
+}
+
 /// One episode on the bus, and how long it took.
 struct Run {
     episode: Episode,
@@ -263,7 +302,7 @@ impl BusTrial<'_> {
     }
 
     fn episode(&self, index: usize, capture: Option<&mut dyn Write>) -> Result<Run> {
-        let seed = episode_seed(self.common.seed, index as u64);
+        let seed = episode_seed(self.common.seed(), index as u64);
         let sil = self.sil_config(seed);
         let policy = Policy::parse(self.image).map_err(|e| anyhow::anyhow!("{e}"))?;
         let local = InProcess::new(policy);
@@ -316,16 +355,17 @@ impl BusTrial<'_> {
         if self.parity {
             plant.keep_trace();
         }
-        *recorder = recorded.map(|name| Recorder::new(name, &plant, &sil.faults));
+        let mut plant = Coarse { plant, times: self.common.physics.finer };
+        *recorder = recorded.map(|name| Recorder::new(name, &plant.plant, &sil.faults));
         let report = sil::run_on(launcher, &mut plant, policy, sil, capture, &mut |cycle, plant| {
             if let Some(recorder) = recorder {
-                recorder.cycle(cycle, plant);
+                recorder.cycle(cycle, &plant.plant);
             }
         })?;
-        if let Some(trouble) = plant.trouble() {
+        if let Some(trouble) = plant.plant.trouble() {
             bail!("at {:.3} s {trouble}", report.duration_ns as f64 * 1e-9);
         }
-        Ok(Outcome { plant, report })
+        Ok(Outcome { plant: plant.plant, report })
     }
 
     /// Runs all episodes. `progress` is called after each.
@@ -334,7 +374,7 @@ impl BusTrial<'_> {
         capture: Option<&mut dyn Write>,
         progress: &(dyn Fn() + Sync),
     ) -> Result<(BusReport, Vec<crate::replay::Episode>)> {
-        let episodes = self.common.episodes as usize;
+        let episodes = self.common.episodes() as usize;
         self.common.fault.check(self.config.robot.modules)?;
         if self.bus.drop.is_some_and(|p| !(0.0..=1.0).contains(&p)) {
             bail!("--drop is a probability: 0 to 1");
@@ -363,7 +403,10 @@ impl BusTrial<'_> {
         let episodes: Vec<Episode> = runs.iter().map(|r| r.episode).collect();
         let virtual_time: f64 = runs.iter().map(|r| r.report.duration_ns as f64 * 1e-9).sum();
         let report = BusReport {
-            task: Report::new(&episodes, self.config.robot.modules, &self.common.fault.to_string()),
+            task: Report {
+                physics: self.common.physics.to_string(),
+                ..Report::new(&episodes, &self.config, &self.common.fault.to_string())
+            },
             bus: if self.bus.bus == Bus::Fd { "fd" } else { "classic" },
             bus_load: runs.iter().map(|r| r.report.bus_load).sum::<f64>() / n,
             latent_age_max_ms: runs.iter().map(|r| r.report.latent_age_max_ms).fold(0.0, f64::max),
@@ -381,13 +424,13 @@ impl BusTrial<'_> {
 pub fn run(arguments: &Arguments) -> Result<()> {
     let common = &arguments.common;
     let source = PolicySource::load(&common.policy)?;
-    let PolicySource::Image(image) = &source else {
+    let Some(image) = source.image() else {
         bail!(
             "{} is no policy image: sil runs what is flashed, so freeze the run first with `snakectl export`",
             common.policy
         );
     };
-    let config = Arc::new(source.environment(common.task, common.robot()?.as_ref())?);
+    let config = Arc::new(common.environment(&source)?);
     warn_if_crowded(&arguments.bus, &config);
     let record = if arguments.replay.is_some() { REPLAYED } else { 0 };
     let qemu = arguments.emulation.launcher(image)?;

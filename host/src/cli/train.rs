@@ -10,16 +10,13 @@ use crc::{CRC_32_ISO_HDLC, Crc};
 use super::policy_file::{CONFIG_FILE, NETWORK_FILE, load_config};
 use super::task_by_name;
 use crate::env::SnakeEnv;
-use crate::eval::{Pilot, Report, Trial, healthy};
+use crate::eval::{Pilot, Report, Trial, curve_seed, healthy};
 use crate::files::{create_folder, write_whole};
 use crate::methods::Method;
 use crate::network::Network;
 use crate::robot::Robot;
 use crate::run::RunConfig;
 use crate::train::{TrainSummary, train};
-
-/// Seed of the evaluations during training; `snakectl eval` uses others by default.
-const EVALUATION_SEED: u64 = 0x7a1e;
 
 /// Arguments of `train`.
 #[derive(clap::Args, Clone, Debug)]
@@ -121,7 +118,7 @@ pub fn train_in(config: &RunConfig, out: &Path, resuming: bool, name: Option<&st
         let trial = Trial {
             config: &evaluation,
             episodes: config.train.evaluation_episodes.max(1) as usize,
-            seed: EVALUATION_SEED,
+            seed: curve_seed(config.train.seed),
             faults: &healthy,
             threads: config.train.threads(),
         };

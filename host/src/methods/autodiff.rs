@@ -91,7 +91,7 @@ impl ActorLayout {
             let mut heard = batch.heard.iter();
             for (mask, present) in mask.chunks_exact_mut(modules * modules).zip(&batch.modules) {
                 for (mask, heard) in mask.chunks_exact_mut(modules).zip(heard.by_ref().take(*present)) {
-                    for (other, mask) in mask.iter_mut().enumerate().filter(|(other, _)| heard >> other & 1 == 0) {
+                    for (_, mask) in mask.iter_mut().enumerate().filter(|(other, _)| heard >> other & 1 == 0) {
                         *mask = UNHEARD;
                     }
                 }

@@ -9,6 +9,7 @@
 //! | success | `d(head, goal) < 2` units (the paper's `d_g`); ends the episode |
 //! | points on the bus | 0: the goal |
 //! | imagined distance | mean over the modules of `d(p'_i, goal)` |
+//! | why so hard | 2 units are one module, an eighth of the snake. The paper does not state its distances; 10 to 25 units are inferred from the final distances and steps of its tables |
 //!
 //! Observation: [`composer_shared::observation`]. `d` is measured from the centre of the head link.
 

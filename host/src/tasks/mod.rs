@@ -4,8 +4,12 @@
 //! says after every control step what it is worth. Environment and simulated bus use the same.
 //!
 //! Two rewards are offered for every task: `paper`, the reward of Table I in units (times 0.1; the learner's value normalisation makes
-//! the factor immaterial), and `progress`, the decrease of what is left to do, and 2 on success: the same optimum by potential
-//! shaping, denser.
+//! the factor immaterial), and `progress`, the decrease of what is left to do, and 2 on success. `progress` is denser, and another objective: it
+//! replaces the paper's reward instead of adding to it and has no discount in its difference, so that the theorem of potential-based shaping
+//! (Ng, Harada, Russell 1999) does not apply and the optimal policies may differ. Both pay most for getting done, and soon.
+//!
+//! How hard a task is follows from the robot's size, the paper and published tasks, not from what a policy scores; each file's table says why its
+//! numbers are what they are.
 
 pub mod block_pushing;
 pub mod goal_reaching;
@@ -17,6 +21,7 @@ pub mod wall_climbing;
 mod soundness;
 
 use composer_shared::policy::Task;
+use crc::{CRC_32_ISO_HDLC, Crc};
 use pathfinding::kuhn_munkres::kuhn_munkres_min;
 use pathfinding::matrix::Matrix;
 use rand::{Rng, RngExt};
@@ -51,7 +56,8 @@ pub struct TaskSettings {
     /// Which task, by its name on the command line.
     #[serde(with = "task_name")]
     pub name: Task,
-    /// Control steps before the episode is cut; the value of the last state is bootstrapped.
+    /// Control steps before the episode is cut, for a snake of up to eight modules ([`TaskSettings::cap_for`]); the value of the last
+    /// state is bootstrapped.
     pub cap: u32,
     /// Reward of the training.
     pub reward: Reward,
@@ -66,7 +72,17 @@ impl Default for TaskSettings {
     }
 }
 
+/// The longest snake that has no more control steps than [`TaskSettings::cap`]: the paper's.
+const CAPPED_MODULES: usize = 8;
+
 impl TaskSettings {
+    /// Control steps before the episode of a snake of so many modules is cut. Beyond eight modules they grow with its length: a longer snake has
+    /// farther to go before its tail is where its head was, and the slack of the shape tasks grows with it.
+    pub fn cap_for(&self, modules: usize) -> u32 {
+        let scaled = (u64::from(self.cap) * modules.max(CAPPED_MODULES) as u64).div_ceil(CAPPED_MODULES as u64);
+        scaled.min(u32::MAX.into()) as u32
+    }
+
     /// Checks the settings; the error is a sentence.
     pub fn validate(&self) -> Result<(), String> {
         if !(self.rearing_penalty >= 0.0 && self.rearing_penalty.is_finite()) {
@@ -220,6 +236,43 @@ impl TaskConfig {
         self.settings.validate()?;
         self.rules().validate(robot)
     }
+
+    /// The settings of the task in use that an episode depends on, by name: its scenes, what counts as success, and the cap. What only the reward
+    /// of a training depends on is not among them.
+    pub fn judged(&self) -> serde_json::Map<String, serde_json::Value> {
+        let rules = &self.rules;
+        let text = match self.settings.name {
+            Task::GoalReaching => serde_json::to_string(&rules.goal_reaching),
+            Task::BlockPushing => serde_json::to_string(&rules.block_pushing),
+            Task::ShapeFormation => serde_json::to_string(&rules.shape_formation),
+            Task::TubeCrossing => serde_json::to_string(&rules.tube_crossing),
+            Task::WallClimbing => serde_json::to_string(&rules.wall_climbing),
+        };
+        // By way of the text, in which a 32-bit number has no more digits than it needs.
+        let mut settings: serde_json::Map<_, _> =
+            text.and_then(|text| serde_json::from_str(&text)).expect("rules are plain data");
+        settings.insert("cap".into(), self.settings.cap.into());
+        settings
+    }
+
+    /// CRC-32 of the task's name and [`TaskConfig::judged`], one `name value` a line in the order of the names; what a policy image says it was
+    /// trained for. Never 0, which means that it is not known.
+    pub fn digest(&self) -> u32 {
+        let mut lines: Vec<String> = self.judged().iter().map(|(name, value)| format!("{name} {value}\n")).collect();
+        lines.sort();
+        let text = format!("{}\n{}", self.settings.name, lines.concat());
+        Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(text.as_bytes()).max(1)
+    }
+
+    /// How the settings that an episode depends on differ from those of `other`, such as `success_distance = 1 instead of 1.5`; empty if they do not.
+    pub fn differences(&self, other: &TaskConfig) -> Vec<String> {
+        let (ours, theirs) = (self.judged(), other.judged());
+        let differ = ours.iter().filter(|(name, value)| theirs.get(*name) != Some(value));
+        let none = serde_json::Value::Null;
+        differ
+            .map(|(name, value)| format!("{name} = {value} instead of {}", theirs.get(name).unwrap_or(&none)))
+            .collect()
+    }
 }
 
 /// Watches an episode.
@@ -359,6 +412,31 @@ mod tests {
         }
         let shape = [[0.0; 3], [1.0, 2.0, 3.0]];
         assert_eq!(wasserstein(&shape, &[shape[1], shape[0]]), 0.0);
+    }
+
+    #[test]
+    fn the_cap_grows_with_the_snake_beyond_eight_modules() {
+        let settings = TaskSettings::default();
+        let caps = [1, 3, 7, 8, 9, 10, 11, 16, 64].map(|modules| settings.cap_for(modules));
+        assert_eq!(caps, [125, 125, 125, 125, 141, 157, 172, 250, 1000]);
+        assert_eq!(TaskSettings { cap: u32::MAX, ..settings }.cap_for(64), u32::MAX);
+    }
+
+    #[test]
+    fn the_digest_is_of_what_an_episode_depends_on() {
+        let digests: Vec<u32> = Task::ALL.map(|task| TaskConfig::new(task).digest()).into();
+        assert!(digests.iter().enumerate().all(|(i, d)| *d != 0 && !digests[..i].contains(d)));
+        let default = TaskConfig::new(Task::BlockPushing);
+        let mut other = default.clone();
+        other.settings.rearing_penalty = 0.4;
+        other.settings.reward = Reward::Paper;
+        other.rules.wall_climbing.wall_bearing = 1.0;
+        assert_eq!((other.digest(), other.differences(&default).len()), (default.digest(), 0));
+        other.rules.block_pushing.success_distance = 1.25;
+        assert_ne!(other.digest(), default.digest());
+        assert_eq!(other.differences(&default), ["success_distance = 1.25 instead of 1.0"]);
+        other.settings.cap = 126;
+        assert_eq!(other.differences(&default).len(), 2);
     }
 
     fn permute(order: &mut [usize; 5], from: usize, each: &mut impl FnMut(&[usize; 5])) {

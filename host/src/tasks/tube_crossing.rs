@@ -10,6 +10,7 @@
 //! | success | the head has gone through the tube and `d(head, goal) < 2` units; ends the episode |
 //! | points on the bus | 0: the goal, 1: the entrance's centre, 2: the middle of the tube's centre line |
 //! | imagined distance | mean over the modules of the way left from `p'_i` |
+//! | why so hard | 2.4 units are three bodies wide, too narrow to turn round in; 8 to 12 units are half to three quarters of the snake, so that it is held on both sides for most of its length; the goal is reached only from the far end. The paper states no sizes |
 
 use std::f32::consts::PI;
 

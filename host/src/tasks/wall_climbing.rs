@@ -10,6 +10,7 @@
 //! | success | the centre of the last link is behind the far face; ends the episode |
 //! | points on the bus | 0: the goal, 1: the foot of the near face, nearest to the head, 2: the middle of the top above it |
 //! | imagined distance | what is left to do from `p'` |
+//! | why so hard | 1.0 to 1.6 units are 1.25 to 2 bodies high: none can be crept over flat, all can be reached by one module put upright (2 units). The tail has to be over it, not the head alone. The paper states no height |
 //!
 //! If each module's way counted for itself, a snake would lie down along the foot of the wall, which brings most modules most of
 //! their way, and never leave it.

@@ -7,7 +7,7 @@ use anyhow::{Result, bail};
 
 use crate::env::SnakeEnv;
 use crate::environment::{Environment, View};
-use crate::eval::{Pilot, episode_seed};
+use crate::eval::{DEFAULT_SEED, Pilot, episode_seed};
 use crate::files::write_whole;
 use crate::network::Network;
 use crate::plot::{Heatmap, heatmaps};
@@ -22,7 +22,7 @@ const TRIED: u64 = 100;
 pub fn write(config: &RunConfig, network: &Network, path: &Path) -> Result<()> {
     let env = Arc::new(config.evaluation());
     for index in 0..TRIED {
-        let Some(matrices) = successful(&env, network, episode_seed(super::FINAL_SEED, index))? else { continue };
+        let Some(matrices) = successful(&env, network, episode_seed(DEFAULT_SEED, index))? else { continue };
         let last = matrices.len() - 1;
         let maps = (0..MAPS).map(|k| {
             let step = k * last / (MAPS - 1);

@@ -1,6 +1,9 @@
 //! `snakectl report`: the published comparisons, from nothing. Killed, it goes on where it was; what is done is skipped.
 
 mod attention_maps;
+mod policies;
+mod robustness;
+mod rows;
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -13,26 +16,44 @@ use serde_json::{Value, json};
 
 use super::policy_file::{CONFIG_FILE, load_config, load_run};
 use super::train::train_in;
-use crate::eval::{Pilot, Trial, healthy, parallel};
+use crate::eval::{PUBLISHED_EPISODES, PUBLISHED_SEED, Pilot, Trial, healthy, parallel};
 use crate::files::{create_folder, write_whole};
 use crate::methods::Method;
 use crate::plot::{Axes, Panel, common_grid, mean_and_error, mean_and_se, panels};
 use crate::run::{Knows, RunConfig};
 use crate::train::Signals;
 
-/// Seed of the final evaluations.
-const FINAL_SEED: u64 = 1;
 /// Metrics of the imagination policy: its reward, and how far the modules are from where it wanted them.
 const IMAGINATION: [&str; 2] = ["imagination/reward", "imagination/follow_error"];
+/// Episodes of a point of a learning curve, of each run its own.
+const CURVE_EPISODES: u64 = 100;
 /// What a run's final evaluation is kept in.
 const RESULT_FILE: &str = "result.json";
 
 /// Arguments of `report`.
 #[derive(clap::Args, Clone, Debug)]
 pub struct Arguments {
-    /// Which comparison
-    #[arg(value_enum)]
-    what: What,
+    #[command(subcommand)]
+    which: Which,
+}
+
+/// What can be published.
+#[derive(clap::Subcommand, Clone, Debug)]
+enum Which {
+    /// Goal Reaching: mappo against composer-no-imagination, goal known to all modules and to the head alone.
+    Attention(Comparison),
+    /// All five tasks: composer against itself without imagination and without attention (the paper's ablation), and where the
+    /// modules of the complete method attend.
+    Ablation(Comparison),
+    /// The policies that ship: trained with several seeds, frozen, measured; the one of the median success goes to shared/policies.
+    Policies(policies::Arguments),
+    /// The policies that ship on other physics: a finer step, another solver, other friction, mass and stiffness.
+    Robustness(robustness::Arguments),
+}
+
+/// Arguments of a comparison of methods.
+#[derive(clap::Args, Clone, Debug)]
+struct Comparison {
     /// Folder of the training runs [default: runs/WHAT]
     #[arg(long, value_name = "DIR")]
     runs: Option<PathBuf>,
@@ -45,8 +66,8 @@ pub struct Arguments {
     /// Seeds
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=100))]
     seeds: u64,
-    /// Episodes of the evaluations at the end
-    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..=100_000))]
+    /// Episodes of the evaluations at the end, the first of the published ones
+    #[arg(long, default_value_t = PUBLISHED_EPISODES, value_parser = clap::value_parser!(u64).range(1..=100_000))]
     episodes: u64,
     /// Training runs side by side, each on its share of the cores: the fewer cores a run has, the less it waits for itself
     /// [default: the cores]
@@ -57,12 +78,10 @@ pub struct Arguments {
     so_far: bool,
 }
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+/// The comparisons of methods.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum What {
-    /// Goal Reaching: mappo against composer-no-imagination, goal known to all modules and to the head alone
     Attention,
-    /// All five tasks: composer against itself without imagination and without attention (the paper's ablation), and where the
-    /// modules of the complete method attend
     Ablation,
 }
 
@@ -133,7 +152,16 @@ struct Run {
 
 /// Runs the verb.
 pub fn run(arguments: &Arguments) -> Result<()> {
-    let what = arguments.what;
+    match &arguments.which {
+        Which::Attention(arguments) => compare(What::Attention, arguments),
+        Which::Ablation(arguments) => compare(What::Ablation, arguments),
+        Which::Policies(arguments) => policies::run(arguments),
+        Which::Robustness(arguments) => robustness::run(arguments),
+    }
+}
+
+/// Makes a comparison of methods.
+fn compare(what: What, arguments: &Comparison) -> Result<()> {
     let folder = arguments.runs.clone().unwrap_or_else(|| Path::new("runs").join(what.name()));
     let out = arguments.out.clone().unwrap_or_else(|| Path::new("host/results").join(what.name()));
     let mut runs = Vec::new();
@@ -147,10 +175,10 @@ pub fn run(arguments: &Arguments) -> Result<()> {
                 config.train.total_steps = arguments.steps.saturating_mul(longer);
                 config.train.evaluate_every = (config.train.total_steps / 10).max(1);
                 if what == What::Ablation {
-                    // Short runs, at the rate of the shipped policies; three seeds make 90 episodes a point.
+                    // Short runs, at the rate of the shipped policies.
                     config.train.learning_rate = 7e-4;
-                    config.train.evaluation_episodes = 30;
                 }
+                config.train.evaluation_episodes = CURVE_EPISODES;
                 runs.push(Run { folder: folder.join(format!("{method}-{name}-{seed}")), config, panel });
             }
         }
@@ -185,45 +213,62 @@ pub fn run(arguments: &Arguments) -> Result<()> {
 }
 
 /// Trains and evaluates all runs, some at a time. False: interrupted.
-fn finish_all(what: What, runs: &[Run], arguments: &Arguments) -> Result<bool> {
-    let jobs = arguments.jobs.map_or_else(super::cores, |jobs| jobs as usize).min(runs.len());
+fn finish_all(what: What, runs: &[Run], arguments: &Comparison) -> Result<bool> {
+    let folders: Vec<&Path> = runs.iter().map(|run| &*run.folder).collect();
+    side_by_side(&folders, arguments.jobs, |number, threads| finish(what, &runs[number], arguments.episodes, threads))
+}
+
+/// Works on all runs, `jobs` at a time (default: the cores), each on its share of the cores: `job` gets a run's number and its threads. False:
+/// interrupted; the runs that had not begun are left out.
+fn side_by_side(folders: &[&Path], jobs: Option<u64>, job: impl Fn(usize, usize) -> Result<()> + Sync) -> Result<bool> {
+    let jobs = jobs.map_or_else(super::cores, |jobs| jobs as usize).min(folders.len()).max(1);
     let threads = (super::cores() / jobs).max(1);
     let stop = Signals::new()?;
     let failed = AtomicBool::new(false);
-    let results = parallel(runs.len(), jobs, |number| {
+    let results = parallel(folders.len(), jobs, |number| {
         if stop.raised() || failed.load(Ordering::Relaxed) {
             return Ok(());
         }
-        eprintln!("run {} of {}: {}", number + 1, runs.len(), runs[number].folder.display());
-        finish(what, &runs[number], arguments.episodes, threads).inspect_err(|_| failed.store(true, Ordering::Relaxed))
+        eprintln!("run {} of {}: {}", number + 1, folders.len(), folders[number].display());
+        job(number, threads).inspect_err(|_| failed.store(true, Ordering::Relaxed))
     });
     results.into_iter().collect::<Result<()>>()?;
     Ok(!stop.raised())
 }
 
+/// Refuses a folder that holds a run with other settings; whether there is one with these.
+fn begun(folder: &Path, config: &RunConfig) -> Result<bool> {
+    let file = folder.join(CONFIG_FILE);
+    if !file.exists() {
+        return Ok(false);
+    }
+    let mut was = load_config(&file)?;
+    was.train.threads = config.train.threads;
+    if was != *config {
+        bail!("{} holds a run with other settings; choose another --runs folder", folder.display());
+    }
+    Ok(true)
+}
+
+/// Trains a run on `threads` threads, or goes on with it. False: interrupted, the next time it goes on from there.
+fn trained(folder: &Path, config: &RunConfig, threads: usize) -> Result<bool> {
+    let mut config = config.clone();
+    config.train.threads = threads;
+    let begun = begun(folder, &config)?;
+    let name = folder.file_name().unwrap_or_default().to_string_lossy();
+    Ok(!train_in(&config, folder, begun, Some(&name))?.interrupted)
+}
+
 /// Trains and evaluates a run on `threads` threads unless that is done; interrupted, it leaves the rest to the next time.
 fn finish(what: What, run: &Run, episodes: u64, threads: usize) -> Result<()> {
     let result = run.folder.join(RESULT_FILE);
-    let begun = run.folder.join(CONFIG_FILE).exists();
-    let mut config = run.config.clone();
-    config.train.threads = threads;
-    if begun {
-        let mut was = load_config(&run.folder.join(CONFIG_FILE))?;
-        was.train.threads = threads;
-        if was != config {
-            bail!("{} holds a run with other settings; choose another --runs folder", run.folder.display());
-        }
-    }
-    if result.exists() {
-        return Ok(());
-    }
-    let name = run.folder.file_name().unwrap_or_default().to_string_lossy();
-    if train_in(&config, &run.folder, begun, Some(&name))?.interrupted {
+    begun(&run.folder, &run.config)?;
+    if result.exists() || !trained(&run.folder, &run.config, threads)? {
         return Ok(());
     }
     let (config, network) = load_run(&run.folder)?;
     let env = Arc::new(config.evaluation());
-    let trial = Trial { config: &env, episodes: episodes as usize, seed: FINAL_SEED, faults: &healthy, threads };
+    let trial = Trial { config: &env, episodes: episodes as usize, seed: PUBLISHED_SEED, faults: &healthy, threads };
     let mut results = serde_json::Map::new();
     for (fault, _) in what.faults() {
         let plan: composer_sim_bridge::faults::FaultPlan =

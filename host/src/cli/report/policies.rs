@@ -1,0 +1,349 @@
+//! `snakectl report policies`: every policy that ships, from nothing. Each task is trained with several seeds; the policy of the median success ships,
+//! and its manifest says what the others can do.
+
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail};
+use composer_shared::policy::{Policy, Task};
+use serde_json::{Value, json};
+
+use super::rows::Rows;
+use super::{begun, side_by_side, trained};
+use crate::cli::export::{CALIBRATION_EPISODES, Exported, Measured, SeedRows, freeze_run, measure, rows, wall_seconds};
+use crate::cli::policy_file::{CONFIG_FILE, NETWORK_FILE, load_config};
+use crate::cli::task_by_name;
+use crate::eval::PUBLISHED_EPISODES;
+use crate::files::{create_folder, write_whole};
+use crate::freeze::Parity;
+use crate::run::RunConfig;
+use crate::stats::with_interval;
+
+/// The image of a run that has been trained to its end, in its folder.
+const IMAGE_FILE: &str = "frozen.policy";
+/// What was measured of it.
+const ROWS_FILE: &str = "measured.json";
+/// Most bytes of the metrics that ship with a policy.
+const METRICS_BYTES: usize = 300_000;
+
+/// Arguments of `report policies`.
+#[derive(clap::Args, Clone, Debug)]
+pub struct Arguments {
+    /// Tasks, separated by commas [default: all five]
+    #[arg(long, value_name = "TASK", value_delimiter = ',', value_parser = task_by_name)]
+    tasks: Vec<Task>,
+    /// Seeds, from 1 on
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=100))]
+    seeds: u64,
+    /// Training runs side by side, each on its share of the cores [default: the cores]
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    jobs: Option<u64>,
+    /// Train nothing: freeze, measure and ship what the runs have come to
+    #[arg(long)]
+    only_freeze: bool,
+    /// Change one setting of every run, such as total_steps=4096; may be repeated
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    settings: Vec<String>,
+    /// Episodes of each row, the first of the published ones
+    #[arg(long, default_value_t = PUBLISHED_EPISODES, value_parser = clap::value_parser!(u64).range(1..=100_000))]
+    episodes: u64,
+    /// Folder of the settings, TASK.toml
+    #[arg(long, value_name = "DIR", default_value = "host/configs")]
+    configs: PathBuf,
+    /// Folder of the training runs
+    #[arg(long, value_name = "DIR", default_value = "runs/policies")]
+    runs: PathBuf,
+    /// Folder that the policies ship from
+    #[arg(long, value_name = "DIR", default_value = "shared/policies")]
+    ship: PathBuf,
+    /// Folder for the tables and the data
+    #[arg(long, value_name = "DIR", default_value = "host/results/policies")]
+    out: PathBuf,
+}
+
+/// A task with one seed.
+struct Run {
+    task: Task,
+    folder: PathBuf,
+    config: RunConfig,
+}
+
+/// What a run came to.
+struct Done<'a> {
+    run: &'a Run,
+    config: RunConfig,
+    image: Vec<u8>,
+    parity: Parity,
+    measured: Vec<Measured>,
+}
+
+impl Done<'_> {
+    fn healthy(&self) -> f64 {
+        self.measured.first().map_or(0.0, |row| row.success_rate)
+    }
+
+    fn seed(&self) -> u64 {
+        self.config.train.seed
+    }
+}
+
+/// Runs the verb.
+pub fn run(arguments: &Arguments) -> Result<()> {
+    let tasks = if arguments.tasks.is_empty() { Task::ALL.to_vec() } else { arguments.tasks.clone() };
+    let mut runs = Vec::new();
+    for &task in &tasks {
+        let file = arguments.configs.join(format!("{task}.toml"));
+        let mut config = load_config(&file)?;
+        if config.task.name != task {
+            bail!("{} has settings for {}, not for {task}", file.display(), config.task.name);
+        }
+        for setting in &arguments.settings {
+            config.set(setting)?;
+        }
+        for seed in 1..=arguments.seeds {
+            config.train.seed = seed;
+            config.validate()?;
+            let folder = arguments.runs.join(format!("{task}-{seed}"));
+            runs.push(Run { task, folder, config: config.clone() });
+        }
+    }
+    if arguments.only_freeze {
+        runs.retain(|run| run.folder.join(NETWORK_FILE).exists());
+        if let Some(task) = tasks.iter().find(|task| !runs.iter().any(|run| run.task == **task)) {
+            bail!("{} holds no run of {task} to freeze: without --only-freeze it is trained", arguments.runs.display());
+        }
+    }
+    // The longest first, so that none is left to run alone at the end.
+    runs.sort_by_key(|run| std::cmp::Reverse(run.config.train.total_steps));
+    for folder in [&arguments.runs, &arguments.ship, &arguments.out] {
+        create_folder(folder)?;
+    }
+    let folders: Vec<&Path> = runs.iter().map(|run| &*run.folder).collect();
+    let finished =
+        side_by_side(&folders, arguments.jobs, |number, threads| finish(&runs[number], arguments, threads).map(drop))?;
+    if !finished {
+        bail!("stopped; the same command goes on from here");
+    }
+    let mut shipped = Vec::new();
+    for task in tasks {
+        let mut done = Vec::new();
+        for run in runs.iter().filter(|run| run.task == task) {
+            // Everything is there already, so that this only reads.
+            done.push(finish(run, arguments, crate::cli::cores())?.context("a run is not finished")?);
+        }
+        done.sort_by_key(Done::seed);
+        shipped.push(ship(done, &arguments.ship)?);
+    }
+    publish(&shipped, &arguments.out)
+}
+
+/// Trains, freezes and measures a run as far as that is not done; none if it was interrupted.
+fn finish<'a>(run: &'a Run, arguments: &Arguments, threads: usize) -> Result<Option<Done<'a>>> {
+    let (image_file, folder) = (run.folder.join(IMAGE_FILE), &run.folder);
+    begun(folder, &run.config)?;
+    let rows_kept = |folder: &Path| Rows::open(&folder.join(ROWS_FILE));
+    let freeze = || -> Result<(RunConfig, Vec<u8>, Parity)> { freeze_run(folder, CALIBRATION_EPISODES, threads) };
+    let (config, image, parity) = match std::fs::read(&image_file) {
+        Ok(image) if Policy::parse(&image).is_ok() && !arguments.only_freeze => {
+            let parity = rows_kept(folder)?.get(&parity_key(&image), || Ok(freeze()?.2))?;
+            (load_config(&folder.join(CONFIG_FILE))?, image, parity)
+        }
+        _ => {
+            if !arguments.only_freeze && !trained(folder, &run.config, threads)? {
+                return Ok(None);
+            }
+            let (config, image, parity) = freeze()?;
+            rows_kept(folder)?.get(&parity_key(&image), || Ok(parity))?;
+            if !arguments.only_freeze {
+                write_whole(&image_file, &image)?;
+            }
+            (config, image, parity)
+        }
+    };
+    let (kept, env) = (rows_kept(folder)?, config.evaluation());
+    let world = world(&env);
+    let measured = rows(config.robot.modules)
+        .into_iter()
+        .map(|(modules, fault)| {
+            let key = format!(
+                "{:08x} {fault} modules={modules} episodes={} world={world:08x}",
+                crc(&image),
+                arguments.episodes
+            );
+            kept.get(&key, || measure(&env, &image, (modules, fault), arguments.episodes, threads))
+        })
+        .collect::<Result<Vec<_>>>()?;
+    Ok(Some(Done { run, config, image, parity, measured }))
+}
+
+fn parity_key(image: &[u8]) -> String {
+    format!("{:08x} parity", crc(image))
+}
+
+fn crc(image: &[u8]) -> u32 {
+    Policy::parse(image).map_or(0, |policy| policy.crc())
+}
+
+/// What an evaluation depends on besides the policy: robot, task, delay.
+pub(super) fn world(env: &crate::env::EnvConfig) -> u32 {
+    let text = format!("{} {:08x} {:?} {:?}", env.robot.fingerprint(), env.task.digest(), env.delay, env.relax_seconds);
+    crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(text.as_bytes())
+}
+
+/// The number of the median success; of an even number the lower one, of equals the earlier seed.
+fn median(success: &[f64]) -> usize {
+    let mut order: Vec<usize> = (0..success.len()).collect();
+    order.sort_by(|a, b| success[*a].total_cmp(&success[*b]));
+    order[(order.len() - 1) / 2]
+}
+
+/// A task with all its seeds; the number of the one that ships.
+struct Shipped<'a> {
+    seeds: Vec<Done<'a>>,
+    chosen: usize,
+}
+
+/// Writes the policy of the median success.
+fn ship<'a>(seeds: Vec<Done<'a>>, to: &Path) -> Result<Shipped<'a>> {
+    let chosen = median(&seeds.iter().map(Done::healthy).collect::<Vec<_>>());
+    let rows = seeds.iter().map(|done| SeedRows { seed: done.seed(), measured: done.measured.clone() }).collect();
+    let done = &seeds[chosen];
+    let folder = &done.run.folder;
+    let metrics = std::fs::read_to_string(folder.join("metrics.jsonl"))
+        .with_context(|| format!("cannot read the metrics of {}", folder.display()))?;
+    let exported = Exported {
+        config: done.config.clone(),
+        run: folder,
+        image: &done.image,
+        parity: done.parity,
+        measured: done.measured.clone(),
+        seeds: rows,
+    };
+    let path = to.join(format!("{}.policy", done.run.task));
+    exported.write(&path, thinned(&metrics, METRICS_BYTES).as_bytes())?;
+    Ok(Shipped { seeds, chosen })
+}
+
+/// As many lines of metrics as fit into so many bytes: those with an evaluation and the last, and of the others every second, third and so on. If that is
+/// too much still, of those with an evaluation as well.
+fn thinned(metrics: &str, most: usize) -> String {
+    let lines: Vec<&str> = metrics.lines().collect();
+    for every in 1..=lines.len() {
+        for keep_evaluations in [true, false] {
+            let kept = lines.iter().enumerate().filter(|(number, line)| {
+                number % every == 0 || *number + 1 == lines.len() || keep_evaluations && line.contains("\"evaluation/")
+            });
+            let text: String = kept.map(|(_, line)| format!("{line}\n")).collect();
+            // Evaluations go only when hardly anything else is left.
+            if text.len() <= most && (keep_evaluations || every >= 50 || every == lines.len()) {
+                return text;
+            }
+        }
+    }
+    String::new()
+}
+
+/// The tables and the data.
+fn publish(shipped: &[Shipped], out: &Path) -> Result<()> {
+    let table = tables(shipped)?;
+    let data: Vec<Value> = shipped
+        .iter()
+        .flat_map(|task| task.seeds.iter().enumerate().map(move |(number, done)| (number == task.chosen, done)))
+        .map(|(ships, done)| {
+            json!({
+                "task": done.run.task.name(), "seed": done.seed(), "ships": ships, "crc32": format!("{:08x}", crc(&done.image)),
+                "environment_steps": done.config.train.total_steps, "wall_seconds": wall_seconds(&done.run.folder),
+                "parity": done.parity, "measured": done.measured,
+            })
+        })
+        .collect();
+    write_whole(&out.join("seeds.json"), serde_json::to_string_pretty(&data)?.as_bytes())?;
+    write_whole(&out.join("table.md"), table.as_bytes())?;
+    print!("{table}");
+    println!("\nwritten to {}", out.display());
+    Ok(())
+}
+
+fn success(row: &Measured, digits: usize) -> String {
+    with_interval(row.success_rate, row.success_low, row.success_high, digits)
+}
+
+/// What ships, then all seeds.
+fn tables(shipped: &[Shipped]) -> Result<String> {
+    let chosen: Vec<&Done> = shipped.iter().map(|task| &task.seeds[task.chosen]).collect();
+    let line = |cell: &dyn Fn(&Done) -> String| chosen.iter().map(|done| cell(done)).collect::<Vec<_>>().join(" | ");
+    let Some(first) = chosen.first() else { bail!("there is no policy to publish") };
+    let episodes = first.measured.first().map_or(0, |row| row.episodes);
+    let mut table =
+        format!("{episodes} episodes a row, 95 % interval (Wilson); the seed of the median success ships.\n\n");
+    writeln!(table, "| | {} |\n|---|{}", line(&|done| done.run.task.title().into()), "---|".repeat(chosen.len()))?;
+    for (number, row) in first.measured.iter().enumerate() {
+        let name = match (&*row.fault, number) {
+            ("none", _) => format!("{} modules, at most {} steps", row.modules, row.cap),
+            (fault, _) => format!("`{fault}`"),
+        };
+        writeln!(table, "| {name} | {} |", line(&|done| success(&done.measured[number], 3)))?;
+        if number == 0 {
+            writeln!(table, "| control steps | {} |", line(&|done| format!("{:.1}", done.measured[0].steps_mean)))?;
+        }
+    }
+    writeln!(table, "| seed that ships | {} |", line(&|done| done.seed().to_string()))?;
+    let million = |done: &Done| format!("{:.1}", done.config.train.total_steps as f64 * 1e-6);
+    writeln!(table, "| trained for, million steps | {} |", line(&million))?;
+    writeln!(table, "| in | {} |\n", line(&|done| format!("{:.0} min", wall_seconds(&done.run.folder) / 60.0)))?;
+
+    let faults: Vec<&Measured> = first.measured.iter().filter(|row| row.fault != "none").collect();
+    let headings: Vec<String> = faults.iter().map(|row| format!("`{}`", row.fault)).collect();
+    writeln!(
+        table,
+        "| task | seed | success | steps | {} |\n|{}",
+        headings.join(" | "),
+        "---|".repeat(4 + faults.len())
+    )?;
+    for task in shipped {
+        for (number, done) in task.seeds.iter().enumerate() {
+            let ships = if number == task.chosen { ", ships" } else { "" };
+            let healthy = &done.measured[0];
+            let others =
+                done.measured.iter().filter(|row| row.fault != "none").map(|row| format!("{:.3}", row.success_rate));
+            writeln!(
+                table,
+                "| {} | {}{ships} | {} | {:.1} of {} | {} |",
+                done.run.task.title(),
+                done.seed(),
+                success(healthy, 3),
+                healthy.steps_mean,
+                healthy.cap,
+                others.collect::<Vec<_>>().join(" | ")
+            )?;
+        }
+    }
+    Ok(table)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_median_ships() {
+        assert_eq!(median(&[0.9, 0.2, 0.5]), 2);
+        assert_eq!(median(&[0.9, 0.2]), 1);
+        assert_eq!((median(&[0.7]), median(&[0.5, 0.5, 0.5])), (0, 1));
+    }
+
+    #[test]
+    fn metrics_are_thinned_to_the_evaluations_and_evenly() {
+        let line = |n: usize| match n % 50 {
+            0 => format!("{{\"step\":{n},\"evaluation/success_rate\":0.5}}\n"),
+            _ => format!("{{\"step\":{n},\"charts/success_rate\":0.5}}\n"),
+        };
+        let metrics: String = (0..1001).map(line).collect();
+        assert_eq!(thinned(&metrics, metrics.len()), metrics);
+        let short = thinned(&metrics, 10_000);
+        assert!(short.len() <= 10_000 && short.len() > 6_000, "{}", short.len());
+        assert_eq!(short.matches("evaluation/").count(), 21);
+        assert!(short.ends_with(&line(1000)) && short.starts_with(&line(0)));
+        assert!(thinned(&metrics, 500).len() <= 500 && thinned(&metrics, 500).contains("\"step\":1000,"));
+    }
+}
