@@ -49,7 +49,7 @@ except ImportError as error:
 PROTOCOL = "composer-plant"
 VERSION = 1
 
-# The longest internal step, s: half of it moves the gait's head by less than 0.5 % (--gait --internal-step).
+# The longest internal step, s: half of it moves the gait's head by 0.13 % (--gait --internal-step).
 INTERNAL_STEP = 1.0 / 1000.0
 ITERATIONS = 2
 OVERSPEED_BRAKE = 8.0

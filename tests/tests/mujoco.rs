@@ -13,9 +13,9 @@ use composer_host::external::{Elsewhere, External};
 use composer_host::robot::Robot;
 use composer_host::sim::{Scene, Snake};
 
-/// Head x after ten seconds of the gait, units, under the law of contact, converged: internal steps of 1/250, 1/500, 1/1000 s give -33.70, -34.05,
-/// -34.14.
-const GAIT: f64 = -34.15;
+/// Head x after ten seconds of the gait, units, under the law of contact, to which both simulators converge in first order. The plant with internal
+/// steps of 1/500, 1/1000, 1/2000 s: -34.05, -34.14, -34.18; the simulator with steps of 1/100, 1/200, 1/400, 1/800 s: -34.03, -34.14, -34.19, -34.21.
+const GAIT: f64 = -34.21;
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..").canonicalize().unwrap()
@@ -63,7 +63,7 @@ print(json.dumps(dict(nq=m.nq, nv=m.nv, nu=m.nu, pairs=m.npair, boxes=int((m.geo
         (&["--motors"], 8, 0..=0, 0),
         (&["--modules", "64"], 64, 0..=0, 0),
         (&["--task", "block-pushing", "--seed", "3"], 8, 1..=1, 1),
-        (&["--task", "tube-crossing"], 8, 3..=20, 0),
+        (&["--task", "tube-crossing"], 8, 3..=200, 0),
         (&["--task", "wall-climbing", "--modules", "10"], 10, 1..=1, 0),
     ] {
         succeed(folder.path(), &[&["mjcf", "-o", "m.xml"], arguments].concat());
@@ -113,15 +113,14 @@ print(json.dumps([d.xpos[b].tolist() + d.xquat[b].tolist() for b in range(1, m.n
         q.extend((0..8).flat_map(|module| snake.sensors(module).joint_angles));
         // The last module's last joint does not exist.
         q.pop();
-        assert!(q[7..].iter().any(|angle| angle.abs() > 0.3), "{q:?}");
+        assert!(q[7..].iter().any(|angle| angle.abs() > 0.2), "{q:?}");
         std::fs::write(folder.path().join("q.json"), serde_json::to_string(&q).unwrap()).unwrap();
         let poses = python(folder.path(), &["-c", script]);
         for (link, (position, [x, y, z, w])) in snake.poses().enumerate() {
             let theirs: Vec<f64> = poses[link].as_array().unwrap().iter().map(|n| n.as_f64().unwrap()).collect();
             let off = position.iter().zip(&theirs).map(|(a, b)| (f64::from(*a) - b).abs()).fold(0.0, f64::max);
             let same: f64 = [w, x, y, z].iter().zip(&theirs[3..]).map(|(a, b)| f64::from(*a) * b).sum();
-            // A solver may let hinges give a little, and that adds up along the chain.
-            assert!(off < 0.15 && same.abs() > 0.999, "round {round}, link {link}: {off} {same}");
+            assert!(off < 1e-3 && same.abs() > 0.9999, "round {round}, link {link}: {off} {same}");
         }
     }
 }
@@ -169,7 +168,7 @@ fn wave(snake: &mut Snake, time: f64) {
 fn the_simulator_moves_as_mujoco_does_under_the_same_law() {
     let folder = tempfile::tempdir().unwrap();
     succeed(folder.path(), &["mjcf", "-o", "m.xml"]);
-    for (step, tolerance) in [(0.01, 0.02), (0.005, 0.01), (0.00125, 0.005)] {
+    for (step, tolerance) in [(0.01, 0.01), (0.005, 0.005), (0.00125, 0.002)] {
         let robot = Robot { torque_slew: 400.0, physics_step: step, ..Robot::default() };
         let mut snake = Snake::new(&robot);
         for count in 0..(10.0 / f64::from(step)).round() as usize {
