@@ -1,13 +1,16 @@
-//! The rapier snake as the plant of the simulated bus: complete controllers, real frames, the same physics as in training.
+//! The snake as the plant of the simulated bus: complete controllers, real frames, the same physics as in training, or those of a plant
+//! elsewhere ([`crate::external`]) that the snake here only mirrors.
 
 use std::sync::Arc;
 
 use composer_shared::observation::Sensors;
 use composer_shared::robot::AXES;
 use composer_sim_bridge::Plant;
+use composer_sim_bridge::external_plant::PlantError;
 
 use crate::env::EnvConfig;
 use crate::eval::Episode;
+use crate::external::{Elsewhere, External};
 use crate::sim::Snake;
 use crate::tasks::{Judge, Point};
 
@@ -15,6 +18,8 @@ use crate::tasks::{Judge, Point};
 pub struct SnakePlant {
     config: Arc<EnvConfig>,
     snake: Snake,
+    /// Whoever moves the snake if it does not move itself.
+    external: Option<External>,
     judge: Judge,
     physics_steps: usize,
     /// What the motors get now, by its bits.
@@ -28,12 +33,26 @@ impl SnakePlant {
     pub fn new(config: Arc<EnvConfig>, seed: u64) -> Self {
         let (snake, judge) = config.start(seed);
         let torques = vec![[0; AXES]; config.robot.modules];
-        SnakePlant { config, snake, judge, physics_steps: 0, torques, trace: None }
+        SnakePlant { config, snake, external: None, judge, physics_steps: 0, torques, trace: None }
     }
 
-    /// The same, keeping the torques of every physics step.
-    pub fn traced(config: Arc<EnvConfig>, seed: u64) -> Self {
-        SnakePlant { trace: Some(Vec::new()), ..SnakePlant::new(config, seed) }
+    /// The same episode, of a plant elsewhere.
+    pub fn elsewhere(config: Arc<EnvConfig>, seed: u64, elsewhere: &Elsewhere) -> Result<Self, PlantError> {
+        let plant = SnakePlant::new(config, seed);
+        let scene = &plant.judge.course().scene;
+        let (external, mut snake) = External::start(elsewhere, &plant.config.robot, scene, seed)?;
+        snake.fit_sensors(&plant.config.sensors, seed);
+        Ok(SnakePlant { snake, external: Some(external), ..plant })
+    }
+
+    /// Why the plant elsewhere did not go on to the end, if so: then nothing about the episode means anything.
+    pub fn trouble(&self) -> Option<&PlantError> {
+        self.external.as_ref().and_then(External::trouble)
+    }
+
+    /// Keeps the torques of every physics step from now on.
+    pub fn keep_trace(&mut self) {
+        self.trace = Some(Vec::new());
     }
 
     /// The torques (yaw and pitch, by their bits) of all physics steps so far, in each module by module; empty if they are not kept.
@@ -72,7 +91,10 @@ impl Plant for SnakePlant {
     }
 
     fn sensors(&self, module: usize) -> Sensors {
-        self.snake.sensors(module)
+        match &self.external {
+            Some(external) => external.sensors(&self.snake, module),
+            None => self.snake.sensors(module),
+        }
     }
 
     fn point(&self, number: u8) -> Option<Point> {
@@ -88,7 +110,10 @@ impl Plant for SnakePlant {
         if let Some(trace) = &mut self.trace {
             trace.extend_from_slice(&self.torques);
         }
-        self.snake.step();
+        match &mut self.external {
+            Some(external) => external.step(&mut self.snake),
+            None => self.snake.step(),
+        }
         self.judge.watch(&self.config.task, &self.snake);
         self.physics_steps += 1;
         if self.physics_steps.is_multiple_of(self.config.substeps()) {
@@ -97,6 +122,6 @@ impl Plant for SnakePlant {
     }
 
     fn done(&self) -> bool {
-        self.judge.verdict().success || self.judge.steps() >= self.config.task.settings.cap
+        self.judge.verdict().success || self.judge.steps() >= self.config.cap() || self.trouble().is_some()
     }
 }

@@ -4,11 +4,13 @@
 //! [`bus`] is the bus, with [`frame_bits`] for the length of frames and [`faults`] for what goes wrong; [`candump`] writes and
 //! reads its logs. [`sil`] puts complete firmware controllers and the ground station ([`station`]) on it and lets them control
 //! anything that implements [`Plant`]. A module's controller runs in this process or elsewhere ([`computer`], [`remote`]), above all in an
-//! emulated microcontroller ([`qemu`]). [`sensor_model`] makes of the true state of a module what its chips read. Nothing here depends on wall-clock time: the same seed gives the same run, bit for bit.
+//! emulated microcontroller ([`qemu`]), and the plant may be in another process too ([`external_plant`]). [`sensor_model`] makes of the true state
+//! of a module what its chips read. Nothing here depends on wall-clock time: the same seed gives the same run, bit for bit.
 
 pub mod bus;
 pub mod candump;
 pub mod computer;
+pub mod external_plant;
 pub mod faults;
 pub mod frame_bits;
 pub mod plant;

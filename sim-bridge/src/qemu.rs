@@ -167,7 +167,7 @@ impl Launcher for Qemu {
 /// The thread that runs an episode starts its processes and waits for them, so they never outlive it rightfully.
 #[cfg(target_os = "linux")]
 #[allow(unsafe_code)]
-fn die_with_parent(command: &mut Command) {
+pub(crate) fn die_with_parent(command: &mut Command) {
     use std::os::unix::process::CommandExt;
 
     use rustix::process::{Signal, getpid, getppid, set_parent_process_death_signal};
@@ -183,7 +183,7 @@ fn die_with_parent(command: &mut Command) {
 }
 
 #[cfg(not(target_os = "linux"))]
-fn die_with_parent(_: &mut Command) {}
+pub(crate) fn die_with_parent(_: &mut Command) {}
 
 /// A running QEMU and the near end of its link. Dropping it kills it.
 #[derive(Debug)]

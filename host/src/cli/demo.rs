@@ -92,6 +92,7 @@ impl Shipped {
             record,
             qemu: None,
             parity: false,
+            elsewhere: None,
         };
         let bar = common.bar();
         let result = trial.run(None, &|| bar.inc(1));

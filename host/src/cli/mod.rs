@@ -6,6 +6,7 @@ mod demo;
 mod eval;
 mod export;
 mod flash;
+mod mjcf;
 mod physics;
 mod policy_file;
 mod report;
@@ -50,6 +51,8 @@ enum Verb {
     Flash(flash::Arguments),
     /// Print the bus's message database in DBC form.
     Dbc(dbc::Arguments),
+    /// Print robot and scene as a model for MuJoCo.
+    Mjcf(mjcf::Arguments),
 }
 
 /// Where `cargo qemu-image` and `cargo qemu-bench` put an image: in the same target folder as this program, which lies in
@@ -80,6 +83,7 @@ pub fn main() -> ExitCode {
         Some(Verb::Bench(arguments)) => bench::run(&arguments),
         Some(Verb::Flash(arguments)) => flash::run(&arguments),
         Some(Verb::Dbc(arguments)) => dbc::run(&arguments),
+        Some(Verb::Mjcf(arguments)) => mjcf::run(&arguments),
         Some(Verb::Demo(arguments)) => demo::run_one(&arguments),
         None => demo::run(&arguments.demonstration),
     };

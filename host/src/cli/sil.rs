@@ -12,6 +12,7 @@ use composer_shared::policy::Policy;
 use composer_shared::robot::AXES;
 use composer_sim_bridge::Plant;
 use composer_sim_bridge::computer::{InProcess, Launcher};
+use composer_sim_bridge::external_plant::{self, Address};
 use composer_sim_bridge::faults::{FaultKind, PlannedFault};
 use composer_sim_bridge::frame_bits::BitRates;
 use composer_sim_bridge::qemu::{self, Qemu};
@@ -22,6 +23,7 @@ use super::PolicySource;
 use super::eval::{Common, table};
 use crate::env::EnvConfig;
 use crate::eval::{Episode, Report, episode_seed, parallel};
+use crate::external::Elsewhere;
 use crate::files::write_whole;
 use crate::recorder::Recorder;
 use crate::sil::SnakePlant;
@@ -99,6 +101,27 @@ impl Emulation {
     }
 }
 
+/// What the controllers control.
+#[derive(clap::Args, Clone, Debug)]
+pub struct PlantOptions {
+    /// Control a plant elsewhere: a command that is started for every episode, or tcp:127.0.0.1:PORT (see sim-bridge/plant-protocol.md)
+    #[arg(long, value_name = "CMD")]
+    plant: Option<Address>,
+    /// Seconds after which a plant that does not answer is given up
+    #[arg(long, value_name = "S", requires = "plant", default_value_t = external_plant::PATIENCE.as_secs_f64())]
+    plant_timeout: f64,
+}
+
+impl PlantOptions {
+    fn elsewhere(&self) -> Result<Option<Elsewhere>> {
+        if !(0.001..=86_400.0).contains(&self.plant_timeout) {
+            bail!("--plant-timeout is 0.001 to 86400 s");
+        }
+        let patience = Duration::from_secs_f64(self.plant_timeout);
+        Ok(self.plant.clone().map(|address| Elsewhere { address, patience }))
+    }
+}
+
 /// Arguments of `sil`.
 #[derive(clap::Args, Clone, Debug)]
 pub struct Arguments {
@@ -108,6 +131,8 @@ pub struct Arguments {
     bus: BusOptions,
     #[command(flatten)]
     emulation: Emulation,
+    #[command(flatten)]
+    plant: PlantOptions,
     /// Write the frames of the first episode as a candump log
     #[arg(long, value_name = "FILE")]
     capture: Option<PathBuf>,
@@ -201,6 +226,8 @@ pub struct BusTrial<'a> {
     pub qemu: Option<&'a Qemu>,
     /// Compare them with controllers in this process.
     pub parity: bool,
+    /// The plant, if it is not this program's own physics.
+    pub elsewhere: Option<Elsewhere>,
 }
 
 /// The plant as the bus sees it, whose physics take several steps where the bus takes one: sensors are sampled and torques take effect at the same
@@ -236,8 +263,7 @@ impl Plant for Coarse {
     }
 
     fn done(&self) -> bool {
-        let judge = self.plant.judge();
-        judge.verdict().success || judge.steps() >= self.plant.config().cap()
+        self.plant.done()
     }
 }
 
@@ -289,7 +315,10 @@ impl BusTrial<'_> {
             }
             None => self.simulate(&local, policy, &sil, capture, (index < self.record).then_some(&name), &mut recorder),
         }
-        .map_err(|error| if self.qemu.is_some() { error.context(name.clone()) } else { error })?;
+        .map_err(|error| match self.qemu.is_some() || self.elsewhere.is_some() {
+            true => error.context(name.clone()),
+            false => error,
+        })?;
         let wall = start.elapsed().as_secs_f64();
         for lost in &ours.report.lost {
             eprintln!(
@@ -319,15 +348,23 @@ impl BusTrial<'_> {
         recorded: Option<&String>,
         recorder: &mut Option<Recorder>,
     ) -> Result<Outcome> {
-        let new = if self.parity { SnakePlant::traced } else { SnakePlant::new };
-        let times = self.common.physics.finer;
-        let mut plant = Coarse { plant: new(self.config.clone(), sil.seed), times };
+        let mut plant = match &self.elsewhere {
+            Some(elsewhere) => SnakePlant::elsewhere(self.config.clone(), sil.seed, elsewhere)?,
+            None => SnakePlant::new(self.config.clone(), sil.seed),
+        };
+        if self.parity {
+            plant.keep_trace();
+        }
+        let mut plant = Coarse { plant, times: self.common.physics.finer };
         *recorder = recorded.map(|name| Recorder::new(name, &plant.plant, &sil.faults));
         let report = sil::run_on(launcher, &mut plant, policy, sil, capture, &mut |cycle, plant| {
             if let Some(recorder) = recorder {
                 recorder.cycle(cycle, &plant.plant);
             }
         })?;
+        if let Some(trouble) = plant.plant.trouble() {
+            bail!("at {:.3} s {trouble}", report.duration_ns as f64 * 1e-9);
+        }
         Ok(Outcome { plant: plant.plant, report })
     }
 
@@ -351,7 +388,9 @@ impl BusTrial<'_> {
             runs.push(self.episode(0, capture)?);
             progress();
         }
-        let threads = self.common.threads.unwrap_or_else(super::cores);
+        // A server serves one after the other; the second would wait for its greeting.
+        let served = matches!(&self.elsewhere, Some(Elsewhere { address: Address::Tcp(_), .. }));
+        let threads = if served { 1 } else { self.common.threads.unwrap_or_else(super::cores) };
         let rest = parallel(episodes - alone, threads, |index| {
             let run = self.episode(index + alone, None);
             progress();
@@ -403,6 +442,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         record,
         qemu: qemu.as_ref(),
         parity: arguments.emulation.parity,
+        elsewhere: arguments.plant.elsewhere()?,
     };
     let mut captured = Vec::new();
     let capture: Option<&mut dyn Write> = if arguments.capture.is_some() { Some(&mut captured) } else { None };

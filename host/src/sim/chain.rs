@@ -257,11 +257,8 @@ impl Pushed {
     fn turn(&mut self) {
         self.cuboid.axes = Mat3A::from_quat(self.rotation);
         let axes = self.cuboid.axes;
-        let scaled = Mat3A::from_cols(
-            axes.x_axis * self.moments.x,
-            axes.y_axis * self.moments.y,
-            axes.z_axis * self.moments.z,
-        );
+        let scaled =
+            Mat3A::from_cols(axes.x_axis * self.moments.x, axes.y_axis * self.moments.y, axes.z_axis * self.moments.z);
         self.inertia = scaled * axes.transpose();
     }
 }
@@ -483,13 +480,8 @@ impl Chain {
             let diagonal = moment + mass * centre.length_squared();
             let square = |k: f32, unit: Vec3A| unit * diagonal - centre * (mass * k);
             link.inertia = Block {
-                a: Mat3A::from_cols(
-                    square(centre.x, Vec3A::X),
-                    square(centre.y, Vec3A::Y),
-                    square(centre.z, Vec3A::Z),
-                ),
-                b: mass
-                    * Mat3A::from_cols(centre.cross(Vec3A::X), centre.cross(Vec3A::Y), centre.cross(Vec3A::Z)),
+                a: Mat3A::from_cols(square(centre.x, Vec3A::X), square(centre.y, Vec3A::Y), square(centre.z, Vec3A::Z)),
+                b: mass * Mat3A::from_cols(centre.cross(Vec3A::X), centre.cross(Vec3A::Y), centre.cross(Vec3A::Z)),
                 c: Mat3A::from_diagonal(rapier3d::glamx::glam::Vec3::splat(mass)),
             };
         }
@@ -655,8 +647,8 @@ impl Chain {
             link.hessian = link.inertia;
         }
         for joint in self.joints.iter_mut().skip(1) {
-            joint.gradient = dt
-                * (robot.stiffness * (joint.angle + dt * joint.speed) + joint.damping * joint.speed - joint.torque);
+            joint.gradient =
+                dt * (robot.stiffness * (joint.angle + dt * joint.speed) + joint.damping * joint.speed - joint.torque);
         }
         if let Some(block) = &mut self.block {
             let f = block.mass * (block.twist.f - block.old - fall);
@@ -696,8 +688,7 @@ impl Chain {
                         link.hessian.add_lifted(hessian, contact.other_arm);
                     } else {
                         for unit in [Vec3A::X, Vec3A::Y, Vec3A::Z] {
-                            for (link, arm, f) in
-                                [(contact.link, contact.arm, unit), (other, contact.other_arm, -unit)]
+                            for (link, arm, f) in [(contact.link, contact.arm, unit), (other, contact.other_arm, -unit)]
                             {
                                 let wrench = Spatial { n: arm.cross(f), f };
                                 couplings.entries.push(Entry { link, column: couplings.count, wrench });
@@ -862,7 +853,11 @@ impl Chain {
             if slope.abs() <= 0.5 * gain || (at == 1.0 && slope < 0.0) || trial == TRIALS {
                 return;
             }
-            if slope > 0.0 { (high, high_slope) = (at, slope) } else { (low, low_slope) = (at, slope) }
+            if slope > 0.0 {
+                (high, high_slope) = (at, slope)
+            } else {
+                (low, low_slope) = (at, slope)
+            }
             // The slope often stays small until a contact closes and then rises steeply: a straight line between the two would
             // lead back to the start, so go a tenth of the way at least.
             let root = low_slope / (low_slope - high_slope);

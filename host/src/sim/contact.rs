@@ -182,7 +182,10 @@ mod tests {
                 // Friction's dependence on the load is left out of the Hessian, which stays symmetric.
                 let compared = if axis == c.normal { c.normal } else { axis };
                 let (found, expected) = ((response.hessian * axis).dot(compared), slope.dot(compared));
-                assert!((found - expected).abs() < 2e-2 * expected.abs() + 1e-3, "{velocity} {axis}: {found} {expected}");
+                assert!(
+                    (found - expected).abs() < 2e-2 * expected.abs() + 1e-3,
+                    "{velocity} {axis}: {found} {expected}"
+                );
             }
         }
     }

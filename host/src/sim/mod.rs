@@ -411,9 +411,8 @@ impl Snake {
     /// Largest distance between the two halves of a joint, units: how far the solver let the chain come apart.
     pub fn joint_gap(&self) -> f32 {
         let half = Vector::new(0.5 * self.robot.link_length, 0.0, 0.0);
-        let gap = |pair: &[LinkState]| {
-            pair[0].pose().transform_point(-half).distance(pair[1].pose().transform_point(half))
-        };
+        let gap =
+            |pair: &[LinkState]| pair[0].pose().transform_point(-half).distance(pair[1].pose().transform_point(half));
         self.state.links.windows(2).map(gap).fold(0.0, f32::max)
     }
 

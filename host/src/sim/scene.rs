@@ -173,8 +173,7 @@ mod tests {
             for step in 0..400 {
                 snake.step();
                 let links = snake.state().links.iter();
-                let (back, fastest) =
-                    links.fold((0.0f32, 0.0f32), |(b, f), l| (b.max(-l.linear[0]), f.max(speed(l))));
+                let (back, fastest) = links.fold((0.0f32, 0.0f32), |(b, f), l| (b.max(-l.linear[0]), f.max(speed(l))));
                 assert!(back < 0.1 && fastest < 1.1, "{tight}, step {step}: {fastest}, back {back}");
                 assert!(step < 300 || fastest < 0.02, "{tight}, step {step}: {fastest}");
             }

@@ -13,12 +13,12 @@ use super::policies::world;
 use super::rows::Rows;
 use crate::cli::export::Measured;
 use crate::cli::physics::Physics;
-use crate::robot::Solver;
 use crate::cli::{PolicySource, task_by_name};
 use crate::env::EnvConfig;
 use crate::eval::{PUBLISHED_SEED, Trial, healthy};
 use crate::files::{create_folder, write_whole};
 use crate::robot::Robot;
+use crate::robot::Solver;
 use crate::stats::with_interval;
 
 /// Arguments of `report robustness`.
