@@ -231,7 +231,8 @@ impl Robot {
         if !(4..=1000).contains(&self.solver_iterations) {
             return invalid(format!("solver_iterations = {}; 4 to 1000 are possible", self.solver_iterations));
         }
-        for (name, value) in [("rapier_substeps", self.rapier_substeps), ("rapier_iterations", self.rapier_iterations)] {
+        for (name, value) in [("rapier_substeps", self.rapier_substeps), ("rapier_iterations", self.rapier_iterations)]
+        {
             if !(1..=1000).contains(&value) {
                 return invalid(format!("{name} = {value}; 1 to 1000 are possible"));
             }

@@ -1,6 +1,7 @@
 //! `snakectl report`: the published comparisons, from nothing. Killed, it goes on where it was; what is done is skipped.
 
 mod attention_maps;
+mod physics;
 mod policies;
 mod robustness;
 mod rows;
@@ -47,6 +48,8 @@ enum Which {
     Ablation(Comparison),
     /// The policies that ship: trained with several seeds, frozen, measured; the one of the median success goes to shared/policies.
     Policies(policies::Arguments),
+    /// The physics alone: open-loop experiments over steps, tolerances and solvers, against a far finer reference.
+    Physics(physics::Arguments),
     /// The policies that ship on other physics: a finer step, another solver, other friction, mass and stiffness.
     Robustness(robustness::Arguments),
 }
@@ -156,6 +159,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         Which::Attention(arguments) => compare(What::Attention, arguments),
         Which::Ablation(arguments) => compare(What::Ablation, arguments),
         Which::Policies(arguments) => policies::run(arguments),
+        Which::Physics(arguments) => physics::run(arguments),
         Which::Robustness(arguments) => robustness::run(arguments),
     }
 }

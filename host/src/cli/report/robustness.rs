@@ -37,7 +37,7 @@ pub struct Arguments {
     #[arg(long, value_name = "DIR", default_value = "runs/robustness")]
     runs: PathBuf,
     /// Folder for the table and the data
-    #[arg(long, value_name = "DIR", default_value = "host/results/robustness")]
+    #[arg(long, value_name = "DIR", default_value = "host/results/physics")]
     out: PathBuf,
 }
 
@@ -136,7 +136,10 @@ fn publish(
     let mut table = format!("| physics | {} |\n|---|{}\n", titles.join(" | "), "---|".repeat(titles.len()));
     let mut data: Vec<Value> = Vec::new();
     for (words, physics, cells) in results {
-        let success = cells.iter().map(|m| with_interval(m.success_rate, m.success_low, m.success_high, 3));
+        let success = cells.iter().map(|m| {
+            let success = with_interval(m.success_rate, m.success_low, m.success_high, 3);
+            format!("{success} in {:.1}", m.steps_mean)
+        });
         writeln!(table, "| {words} | {} |", success.collect::<Vec<_>>().join(" | "))?;
         for (name, measured) in names.iter().zip(cells) {
             data.push(json!({"policy": name, "row": words, "physics": physics.to_string(), "measured": measured}));
@@ -145,15 +148,15 @@ fn publish(
     if let Some(measured) = results.iter().find_map(|(_, _, cells)| cells.first()) {
         writeln!(
             table,
-            "\nSuccess over {} episodes and its 95 % interval (Wilson), {} modules, at most {} control steps; the policies are not told.",
+            "\nSuccess over {} episodes, its 95 % interval (Wilson), and control steps, {} modules, at most {} control steps; the policies are not told.",
             measured.episodes, measured.modules, measured.cap
         )?;
     }
     for line in left_out {
         eprintln!("note: left out: {line}");
     }
-    write_whole(&out.join("robustness.json"), serde_json::to_string_pretty(&data)?.as_bytes())?;
-    write_whole(&out.join("table.md"), table.as_bytes())?;
+    write_whole(&out.join("policies.json"), serde_json::to_string_pretty(&data)?.as_bytes())?;
+    write_whole(&out.join("policies.md"), table.as_bytes())?;
     print!("{table}");
     println!("\nwritten to {}", out.display());
     Ok(())
