@@ -313,6 +313,12 @@ mod tests {
         assert!(change("link_mass = 0.00294", "link_mass = -1.0").contains("link_mass = -1"));
         assert!(change("link_mass", "link_maas").contains("link_maas"));
         assert!(change("gravity = 196.2", "gravity = nan").contains("gravity"));
+        assert!(
+            change("slip_speed = 0.05", "slip_speed = 0.0").contains("slip_speed = 0; it must be a number above zero")
+        );
+        assert!(change("contact_stiffness = 2000.0", "contact_stiffness = -1.0").contains("contact_stiffness = -1"));
+        assert!(change("physics_step = 0.005", "physics_step = 0.003").contains("a whole part of it"));
+        assert!(change("\"direct\"", "\"mujoco\"").contains("solver"));
         assert!(change("links_per_module = 4", "links_per_module = 5").contains("2 to 4"));
     }
 }

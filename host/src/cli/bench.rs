@@ -13,10 +13,13 @@ use super::PolicySource;
 use crate::env::{EnvConfig, SnakeEnv};
 use crate::environment::{Environment, Told, Trivial, View};
 use crate::eval::{DEFAULT_SEED, Pilot, episode_seed, parallel};
-use crate::methods::{Differentiation, Method};
-use crate::robot::Robot;
+use crate::methods::{Differentiation, Method, mix};
+use crate::mjcf::mjcf;
+use crate::robot::{Robot, Solver};
 use crate::run::RunConfig;
 use crate::sil::SnakePlant;
+use crate::sim::open_loop::Experiment;
+use crate::sim::{Scene, Snake};
 use crate::train::progress::Times;
 use crate::train::{TrainConfig, Trainer};
 
@@ -32,6 +35,9 @@ pub struct Arguments {
     /// Seconds for each figure
     #[arg(long, default_value_t = 5.0)]
     seconds: f64,
+    /// A Python with MuJoCo: runs it on its own MJCF of the robot, with its own contacts, beside the solvers here
+    #[arg(long, value_name = "PYTHON")]
+    mujoco: Option<PathBuf>,
 }
 
 #[derive(clap::Subcommand, Clone, Debug)]
@@ -135,6 +141,60 @@ fn bus(image: &[u8], robot: &Robot, seconds: f64) -> Result<(f64, f64)> {
     Ok((virtual_ns as f64 * 1e-9 / start.elapsed().as_secs_f64(), load / episodes.max(1) as f64))
 }
 
+/// Sweeps of the direct solver in a step, and wall time of one with its share of the rest of the step, us; random torques.
+fn sweeps(robot: &Robot, seconds: f64) -> [f64; 2] {
+    let (mut snake, start) = (Snake::new(robot), Instant::now());
+    let mut number = 0u64;
+    while start.elapsed().as_secs_f64() < seconds {
+        for module in 0..robot.modules {
+            let torque = [0, 1].map(|_| {
+                number += 1;
+                robot.torque_limit * ((mix(number) >> 40) as f32 / (1u64 << 23) as f32 - 1.0)
+            });
+            snake.set_torque(module, torque);
+        }
+        (0..snake.steps_in(0.05)).for_each(|_| snake.step());
+    }
+    let effort = snake.effort();
+    let (steps, sweeps) = (effort.steps.max(1) as f64, effort.sweeps.max(1) as f64);
+    [sweeps / steps, 1e6 * start.elapsed().as_secs_f64() / sweeps]
+}
+
+/// The open-loop gait on one thread with each solver, and with MuJoCo's: speed, and where the head comes to.
+fn gaits(robot: &Robot, mujoco: Option<&Path>) -> Result<()> {
+    println!("\nthe open-loop gait of 10 s, one thread, side by side");
+    println!("{:>28} {:>16} {:>8} {:>14}", "", "physics steps/s", "step, s", "head x, units");
+    let row = |name: &str, rate: f64, step: f64, head: f64| println!("{name:>28} {rate:>16.0} {step:>8} {head:>14.2}");
+    for solver in [Solver::Direct, Solver::Rapier] {
+        let robot = Robot { solver, ..robot.clone() };
+        let start = Instant::now();
+        let outcome = Experiment::Gait.run(&robot);
+        let rate = f64::from(Experiment::Gait.seconds() / robot.physics_step) / start.elapsed().as_secs_f64();
+        row(solver.name(), rate, f64::from(robot.physics_step), f64::from(outcome.links[0][0]));
+    }
+    let Some(python) = mujoco else { return Ok(()) };
+    let model = tempfile::Builder::new().suffix(".xml").tempfile()?;
+    std::fs::write(model.path(), mjcf(robot, &Scene::default(), Default::default()))?;
+    let output = std::process::Command::new(python)
+        .args([
+            "sim-bridge/examples/mujoco_plant.py",
+            "--gait",
+            "--own-contacts",
+            "--internal-step",
+            "1/100",
+            "--model",
+        ])
+        .arg(model.path())
+        .output()
+        .with_context(|| format!("cannot start {}", python.display()))?;
+    let told: serde_json::Value = serde_json::from_slice(&output.stdout).with_context(|| {
+        format!("{} did not run the gait: {}", python.display(), String::from_utf8_lossy(&output.stderr).trim())
+    })?;
+    let number = |key: &str| told[key].as_f64().with_context(|| format!("the gait of MuJoCo has no {key}"));
+    row("MuJoCo, its own contacts", number("physics_steps_per_s")?, 0.01, number("head_x")?);
+    Ok(())
+}
+
 /// Runs the verb.
 pub fn run(arguments: &Arguments) -> Result<()> {
     if let Some(What::Firmware(arguments)) = &arguments.what {
@@ -143,17 +203,20 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let seconds = arguments.seconds;
     let cores = super::cores();
     let robot = Robot::default();
-    println!("physics alone, control steps/s (0.05 s, {} physics steps each), random torques", 5);
-    println!("{:>8} {:>12} {:>12}", "modules", "one thread", "all threads");
+    let substeps = EnvConfig::new(Task::GoalReaching, robot.clone()).substeps();
+    println!("physics alone, control steps/s (0.05 s, {substeps} physics steps each), random torques");
+    println!(
+        "{:>8} {:>12} {:>12} {:>16} {:>12}",
+        "modules", "one thread", "all threads", "sweeps a step", "us a sweep"
+    );
     let goal = Task::GoalReaching;
     for modules in LENGTHS {
         let robot = robot.with_modules(modules)?;
-        println!(
-            "{modules:>8} {:>12.0} {:>12.0}",
-            physics(goal, &robot, 1, seconds),
-            physics(goal, &robot, cores, seconds)
-        );
+        let (one, all) = (physics(goal, &robot, 1, seconds), physics(goal, &robot, cores, seconds));
+        let [sweeps, microseconds] = sweeps(&robot, seconds);
+        println!("{modules:>8} {one:>12.0} {all:>12.0} {sweeps:>16.1} {microseconds:>12.1}");
     }
+    gaits(&robot, arguments.mujoco.as_deref())?;
     println!("\nthe same with each task's scene, {} modules, one thread, side by side", robot.modules);
     println!("{:>16} {:>16} {:>14}", "task", "control steps/s", "of the first");
     let rates = scenes(&robot, seconds);
