@@ -2,10 +2,11 @@
 
 mod firmware;
 
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use anyhow::Result;
+use anyhow::{Context, Result};
 use composer_shared::policy::Task;
 use composer_sim_bridge::sil::{self, SilConfig};
 

@@ -97,7 +97,7 @@ fn shipped_manifest(name: &str) -> Option<&'static str> {
 /// A policy to evaluate or to run.
 pub enum PolicySource {
     /// A frozen integer policy image.
-    Image(Frozen),
+    Image(Box<Frozen>),
     /// The float network of a training run, with its settings.
     Run(Box<(Network, RunConfig)>),
     /// No policy: baselines.
@@ -124,17 +124,17 @@ impl PolicySource {
                     .inspect_err(|e| eprintln!("note: {} is not used: it is no manifest, {e:#}", file.display()))
                     .ok(),
             };
-            return Ok(PolicySource::Image(Frozen { name: name.into(), image, manifest }));
+            return Ok(PolicySource::Image(Box::new(Frozen { name: name.into(), image, manifest })));
         }
         match name {
             "still" => Ok(PolicySource::Still),
             "random" => Ok(PolicySource::Random),
             _ => match composer_shared::policies::shipped(name) {
-                Some(image) => Ok(PolicySource::Image(Frozen {
+                Some(image) => Ok(PolicySource::Image(Box::new(Frozen {
                     name: name.into(),
                     image: image.to_vec(),
                     manifest: shipped_manifest(name).map(manifest_task).transpose()?,
-                })),
+                }))),
                 None => bail!(
                     "there is no policy {name}: give an image file, a run folder, still, random, or one that ships ({})",
                     composer_shared::policies::NAMES.join(", ")
@@ -276,9 +276,11 @@ mod tests {
     }
 
     fn manifest(task: &TaskConfig) -> String {
-        let mut run = RunConfig::default();
-        run.task = task.settings.clone();
-        run.block_pushing = task.rules.block_pushing.clone();
+        let run = RunConfig {
+            task: task.settings.clone(),
+            block_pushing: task.rules.block_pushing.clone(),
+            ..RunConfig::default()
+        };
         let text = toml::to_string(&toml::Table::from_iter([("run".into(), toml::Value::try_from(run).unwrap())]));
         // A setting of the learner that this version does not know.
         text.unwrap().replace("[run.train]", "[run.train]\nforgotten = 1")

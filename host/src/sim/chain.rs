@@ -45,6 +45,8 @@
 //!
 //! No fused multiply-add and no library trigonometry but `libm`'s, so that every processor computes the same bits.
 
+#![expect(clippy::needless_range_loop, reason = "matrices are written with their indices, as in the formulas above")]
+
 use rapier3d::glamx::glam::{Mat3A, Quat, Vec3A};
 
 use super::State;
@@ -723,7 +725,7 @@ impl Chain {
                 link.hessian.add_lifted(hessian, contact.arm);
             }
         }
-        self.couplings.entries.sort_by(|a, b| b.link.cmp(&a.link));
+        self.couplings.entries.sort_by_key(|entry| std::cmp::Reverse(entry.link));
     }
 
     /// One step of Newton: sets the steps of head, joints, links and block. Returns `-gradient . step`.
