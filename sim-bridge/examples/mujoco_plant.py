@@ -264,7 +264,7 @@ class Plant:
         e = directions.transpose(2, 0, 1)
         plucker[..., :3] = np.stack(cross_rows(p, e), axis=-1)
         plucker[..., 3:] = directions
-        j = (plucker.reshape(-1, 6) @ self.screws).reshape(3, count, -1)
+        j = (plucker.reshape(-1, 6) @ self.screws).reshape(3, count, self.screws.shape[-1])
         j *= self.moves[row] - self.moves[first]
         return j
 
