@@ -89,8 +89,8 @@ fn every_torque_is_the_same_as_in_process() {
         let parity = &report["parity"];
         let number = |key: &str| parity[key].as_u64().unwrap_or_else(|| panic!("{key} is missing in {report}"));
         assert_eq!((number("different"), number("other"), &report["lost"]), (0, 0, &0.into()), "{report}");
-        // Two axes of eight modules in five physics steps a cycle.
-        assert_eq!(number("torques"), number("cycles") * 5 * 8 * 2, "{report}");
+        // Two axes of eight modules in ten physics steps a cycle.
+        assert_eq!(number("torques"), number("cycles") * 10 * 8 * 2, "{report}");
         assert!(number("cycles") >= 10 * episodes, "{report}");
     }
 }

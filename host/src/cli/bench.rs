@@ -165,7 +165,8 @@ fn sweeps(robot: &Robot, seconds: f64) -> [f64; 2] {
 fn gaits(robot: &Robot, mujoco: Option<&Path>) -> Result<()> {
     println!("\nthe open-loop gait of 10 s, one thread, side by side");
     println!("{:>28} {:>16} {:>8} {:>14}", "", "physics steps/s", "step, s", "head x, units");
-    let row = |name: &str, rate: f64, step: f64, head: f64| println!("{name:>28} {rate:>16.0} {step:>8} {head:>14.2}");
+    let row =
+        |name: &str, rate: f64, step: f64, head: f64| println!("{name:>28} {rate:>16.0} {step:>8.3} {head:>14.2}");
     for solver in [Solver::Direct, Solver::Rapier] {
         let robot = Robot { solver, ..robot.clone() };
         let start = Instant::now();
