@@ -85,6 +85,8 @@ pub struct EnvConfig {
     pub goal_known_to: GoalKnownTo,
     /// Control period, s.
     pub control_period: f32,
+    /// Physics steps in one of the robot's own: at those the bus samples sensors and takes torques, however much finer the physics are.
+    pub finer_by: usize,
     /// Physics steps between sampling the sensors and the new torque, least and most; drawn for each episode.
     pub delay: [usize; 2],
     /// Faults drawn in training.
@@ -103,6 +105,7 @@ impl EnvConfig {
             task: TaskConfig::new(task),
             goal_known_to: GoalKnownTo::All,
             control_period: 0.05,
+            finer_by: 1,
             delay: [1, 1],
             faults: FaultTraining::default(),
             relax_seconds: None,
@@ -114,6 +117,7 @@ impl EnvConfig {
     /// episodes: what comes out differently is the error of the coarser step.
     pub fn finer(mut self, times: usize) -> Self {
         self.robot.physics_step /= times as f32;
+        self.finer_by *= times;
         self.delay = self.delay.map(|steps| steps * times);
         self
     }

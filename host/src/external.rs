@@ -18,7 +18,6 @@ use crate::sim::{LinkState, Scene, Snake, State};
 fn reset(robot: &Robot, scene: &Scene, seed: u64) -> Reset<Robot> {
     let solid =
         |s: &crate::sim::scene::Solid| SolidSetup { half: s.half, position: s.position, rotation: s.rotation() };
-    let turn = |yaw: f32| [0.0, 0.0, libm::sinf(0.5 * yaw), libm::cosf(0.5 * yaw)];
     Reset {
         robot: robot.clone(),
         scene: SceneSetup {
@@ -26,7 +25,7 @@ fn reset(robot: &Robot, scene: &Scene, seed: u64) -> Reset<Robot> {
             block: scene.block.map(|b| BlockSetup {
                 half: b.half,
                 position: b.position,
-                rotation: turn(b.yaw),
+                rotation: b.rotation(),
                 mass: b.mass,
                 friction: b.friction,
             }),

@@ -113,7 +113,8 @@ fn write_model(out: &mut String, robot: &Robot, scene: &Scene, options: Options)
             writeln!(out, "{indent}  <freejoint name=\"root\"/>")?;
         } else {
             let joint = link - 1;
-            let axis = if (joint % robot.links_per_module).is_multiple_of(2) { "0 0 1" } else { "0 1 0" };
+            let [x, y, z] = robot.joint_axis(joint);
+            let axis = format!("{x} {y} {z}");
             writeln!(out, "{indent}<body name=\"{name}\" pos=\"{} 0 0\">", -length)?;
             writeln!(out, "{indent}  <joint name=\"{}\" axis=\"{axis}\"/>", joint_name(robot, joint))?;
         }
@@ -133,7 +134,7 @@ fn write_model(out: &mut String, robot: &Robot, scene: &Scene, options: Options)
     }
     writeln!(out, "    {}", "</body>".repeat(robot.links()))?;
     if let Some(block) = &scene.block {
-        let turn = quaternion([0.0, 0.0, libm::sinf(0.5 * block.yaw), libm::cosf(0.5 * block.yaw)]);
+        let turn = quaternion(block.rotation());
         writeln!(out, "    <body name=\"block\" pos=\"{}\" quat=\"{turn}\">", row(&block.position))?;
         writeln!(out, "      <freejoint name=\"block\"/>")?;
         writeln!(

@@ -251,6 +251,16 @@ impl Robot {
         self.modules * self.links_per_module
     }
 
+    /// Axis of a joint in the frames of both its links: even joints of a module yaw, odd joints pitch.
+    pub fn joint_axis(&self, joint: usize) -> [f32; 3] {
+        [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]][self.motor_of(joint).1]
+    }
+
+    /// The motor that drives a joint: its module, and which of the two axes.
+    pub fn motor_of(&self, joint: usize) -> (usize, usize) {
+        (joint / self.links_per_module, joint % self.links_per_module % 2)
+    }
+
     /// The shape of the chain as the modules know it.
     pub fn geometry(&self) -> Geometry {
         Geometry { links_per_module: self.links_per_module as u8, link_length: self.link_length }

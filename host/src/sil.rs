@@ -87,7 +87,7 @@ impl Plant for SnakePlant {
     }
 
     fn step_ns(&self) -> u64 {
-        (f64::from(self.config.robot.physics_step) * 1e9).round() as u64
+        (f64::from(self.config.robot.physics_step) * self.config.finer_by as f64 * 1e9).round() as u64
     }
 
     fn sensors(&self, module: usize) -> Sensors {
@@ -107,6 +107,16 @@ impl Plant for SnakePlant {
     }
 
     fn step(&mut self) {
+        (0..self.config.finer_by).for_each(|_| self.physics_step());
+    }
+
+    fn done(&self) -> bool {
+        self.judge.verdict().success || self.judge.steps() >= self.config.cap() || self.trouble().is_some()
+    }
+}
+
+impl SnakePlant {
+    fn physics_step(&mut self) {
         if let Some(trace) = &mut self.trace {
             trace.extend_from_slice(&self.torques);
         }
@@ -119,9 +129,5 @@ impl Plant for SnakePlant {
         if self.physics_steps.is_multiple_of(self.config.substeps()) {
             self.judge.step(&self.config.task, &self.snake);
         }
-    }
-
-    fn done(&self) -> bool {
-        self.judge.verdict().success || self.judge.steps() >= self.config.cap() || self.trouble().is_some()
     }
 }

@@ -7,10 +7,8 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
 use composer_firmware::controller::{BusKind, Timing};
-use composer_shared::observation::Sensors;
 use composer_shared::policy::Policy;
 use composer_shared::robot::AXES;
-use composer_sim_bridge::Plant;
 use composer_sim_bridge::computer::{InProcess, Launcher};
 use composer_sim_bridge::external_plant::{self, Address};
 use composer_sim_bridge::faults::{FaultKind, PlannedFault};
@@ -230,43 +228,6 @@ pub struct BusTrial<'a> {
     pub elsewhere: Option<Elsewhere>,
 }
 
-/// The plant as the bus sees it, whose physics take several steps where the bus takes one: sensors are sampled and torques take effect at the same
-/// moments as with the robot's own step, whatever `--finer` says.
-struct Coarse {
-    plant: SnakePlant,
-    times: usize,
-}
-
-impl Plant for Coarse {
-    fn modules(&self) -> usize {
-        self.plant.modules()
-    }
-
-    fn step_ns(&self) -> u64 {
-        (f64::from(self.plant.config().robot.physics_step) * self.times as f64 * 1e9).round() as u64
-    }
-
-    fn sensors(&self, module: usize) -> Sensors {
-        self.plant.sensors(module)
-    }
-
-    fn point(&self, number: u8) -> Option<[f32; 3]> {
-        self.plant.point(number)
-    }
-
-    fn set_torque(&mut self, module: usize, torque: [f32; AXES]) {
-        self.plant.set_torque(module, torque);
-    }
-
-    fn step(&mut self) {
-        (0..self.times).for_each(|_| self.plant.step());
-    }
-
-    fn done(&self) -> bool {
-        self.plant.done()
-    }
-}
-
 /// One episode on the bus, and how long it took.
 struct Run {
     episode: Episode,
@@ -355,17 +316,16 @@ impl BusTrial<'_> {
         if self.parity {
             plant.keep_trace();
         }
-        let mut plant = Coarse { plant, times: self.common.physics.finer };
-        *recorder = recorded.map(|name| Recorder::new(name, &plant.plant, &sil.faults));
+        *recorder = recorded.map(|name| Recorder::new(name, &plant, &sil.faults));
         let report = sil::run_on(launcher, &mut plant, policy, sil, capture, &mut |cycle, plant| {
             if let Some(recorder) = recorder {
-                recorder.cycle(cycle, &plant.plant);
+                recorder.cycle(cycle, plant);
             }
         })?;
-        if let Some(trouble) = plant.plant.trouble() {
+        if let Some(trouble) = plant.trouble() {
             bail!("at {:.3} s {trouble}", report.duration_ns as f64 * 1e-9);
         }
-        Ok(Outcome { plant: plant.plant, report })
+        Ok(Outcome { plant, report })
     }
 
     /// Runs all episodes. `progress` is called after each.

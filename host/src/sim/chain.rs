@@ -384,11 +384,6 @@ pub struct Chain {
     effort: Effort,
 }
 
-/// Axis of the hinge in front of a link, in its own frame: even joints yaw, odd joints pitch.
-fn axis(robot: &Robot, link: usize) -> Vec3A {
-    if ((link - 1) % robot.links_per_module).is_multiple_of(2) { Vec3A::Z } else { Vec3A::Y }
-}
-
 /// The rotation by a vector (axis times angle).
 fn rotation_by(vector: Vec3A) -> Quat {
     let angle = vector.length();
@@ -419,13 +414,11 @@ impl Chain {
         };
         let solids = scene.solids.iter().map(|s| Cuboid::new(s.half, s.position, s.rotation())).collect();
         let block = scene.block.map(|block| {
-            let (sin, cos) = libm::sincosf(0.5 * block.yaw);
-            let [x, y, z] = block.half;
             let mut pushed = Pushed {
-                cuboid: Cuboid::new(block.half, block.position, [0.0, 0.0, sin, cos]),
-                rotation: Quat::from_xyzw(0.0, 0.0, sin, cos),
+                cuboid: Cuboid::new(block.half, block.position, block.rotation()),
+                rotation: Quat::from_array(block.rotation()),
                 mass: block.mass,
-                moments: Vec3A::new(y * y + z * z, x * x + z * z, x * x + y * y) * (block.mass / 3.0),
+                moments: Vec3A::from(block.moments()),
                 friction: block.friction,
                 twist: Spatial::ZERO,
                 momentum: Vec3A::ZERO,
@@ -466,7 +459,7 @@ impl Chain {
         for i in 0..self.links.len() {
             if i > 0 {
                 let front = self.links[i - 1];
-                let axis = axis(robot, i);
+                let axis = Vec3A::from(robot.joint_axis(i - 1));
                 let (sin, cos) = libm::sincosf(0.5 * self.joints[i].angle);
                 let turn = Quat::from_xyzw(0.0, sin * axis.y, sin * axis.z, cos);
                 let link = &mut self.links[i];
@@ -912,8 +905,8 @@ impl Chain {
         };
         for i in 1..self.joints.len() {
             let joint = &mut self.joints[i];
-            let (module, k) = ((i - 1) / robot.links_per_module, (i - 1) % robot.links_per_module);
-            joint.torque = torque[module][k % 2];
+            let (module, axis) = robot.motor_of(i - 1);
+            joint.torque = torque[module][axis];
             joint.damping = robot.damping_at(joint.speed);
         }
         self.find_contacts(robot);

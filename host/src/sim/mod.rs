@@ -112,8 +112,7 @@ pub struct Snake {
     torque: Vec<[f32; AXES]>,
     command: Vec<[f32; AXES]>,
     motion: Motion,
-    block_mass: f32,
-    block_moments: [f32; 3],
+    block: Option<scene::Block>,
     /// Sensors as their datasheets have them; without, a module senses the truth.
     suites: Vec<Suite>,
     /// Physics steps since the sensors were fitted.
@@ -146,9 +145,10 @@ impl Snake {
             position: [-(link as f32) * robot.link_length, 0.0, robot.link_radius],
             ..LinkState::REST
         };
-        let block = scene.block.map(|block| {
-            let (sin, cos) = libm::sincosf(0.5 * block.yaw);
-            LinkState { position: block.position, rotation: [0.0, 0.0, sin, cos], ..LinkState::REST }
+        let block = scene.block.map(|block| LinkState {
+            position: block.position,
+            rotation: block.rotation(),
+            ..LinkState::REST
         });
         let mut snake = Snake {
             robot: robot.clone(),
@@ -162,8 +162,7 @@ impl Snake {
             torque: vec![[0.0; AXES]; robot.modules],
             command: vec![[0.0; AXES]; robot.modules],
             motion: Motion::default(),
-            block_mass: scene.block.map_or(0.0, |b| b.mass),
-            block_moments: scene.block.map_or([0.0; 3], |b| b.moments()),
+            block: scene.block,
             suites: Vec::new(),
             steps: 0,
         };
@@ -400,10 +399,10 @@ impl Snake {
                 + robot.link_mass * robot.gravity * link.position[2]
         });
         let springs = self.state.joint_angles.iter().map(|angle| 0.5 * robot.stiffness * angle * angle);
-        let block = self.state.block.map_or(0.0, |block| {
-            let turning: f32 =
-                block.seen(block.angular).iter().zip(self.block_moments).map(|(w, moment)| 0.5 * moment * w * w).sum();
-            turning + self.block_mass * (0.5 * square(block.linear) + robot.gravity * block.position[2])
+        let block = self.state.block.zip(self.block).map_or(0.0, |(state, block)| {
+            let spin = state.seen(state.angular);
+            let turning: f32 = spin.iter().zip(block.moments()).map(|(w, moment)| 0.5 * moment * w * w).sum();
+            turning + block.mass * (0.5 * square(state.linear) + robot.gravity * state.position[2])
         });
         links.sum::<f32>() + springs.sum::<f32>() + block
     }

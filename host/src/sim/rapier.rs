@@ -137,7 +137,7 @@ impl RapierSnake {
                 .user_data(link as u128);
             world.colliders.insert_with_parent(collider, handle, &mut world.bodies);
             if let Some(&front) = links.last() {
-                let axis = axis(robot, link - 1);
+                let axis = Vector::from(robot.joint_axis(link - 1));
                 let joint = GenericJointBuilder::new(JointAxesMask::LOCKED_REVOLUTE_AXES)
                     .local_axis1(axis)
                     .local_axis2(axis)
@@ -169,10 +169,10 @@ impl RapierSnake {
     /// One step: `torque` is that on each axis of each module, `speeds` those of the joints now.
     pub fn step(&mut self, robot: &Robot, torque: &[[f32; 2]], speeds: &[f32]) {
         for (index, speed) in speeds.iter().enumerate() {
-            let (module, k) = (index / robot.links_per_module, index % robot.links_per_module);
+            let (module, axis) = robot.motor_of(index);
             if let Some(joint) = self.world.impulse_joints.get_mut(self.joints[index], false) {
                 let motor = &mut joint.data.motors[JointAxis::AngX as usize];
-                motor.target_pos = torque[module][k % 2] / robot.stiffness;
+                motor.target_pos = torque[module][axis] / robot.stiffness;
                 motor.damping = robot.damping_at(*speed);
             }
         }
@@ -253,7 +253,7 @@ impl RapierSnake {
         }
         for index in 0..self.joints.len() {
             let (front, rear) = (&self.world.bodies[self.links[index]], &self.world.bodies[self.links[index + 1]]);
-            let axis = axis(robot, index);
+            let axis = Vector::from(robot.joint_axis(index));
             state.joint_speeds[index] = (rear.angvel() - front.angvel()).dot(front.rotation() * axis);
             let relative = front.rotation().inverse() * *rear.rotation();
             let angle = 2.0 * libm::atan2f(Vector::new(relative.x, relative.y, relative.z).dot(axis), relative.w);
@@ -274,9 +274,4 @@ fn of(body: &RigidBody) -> LinkState {
         linear: body.linvel().to_array(),
         angular: body.angvel().to_array(),
     }
-}
-
-/// Axis of a joint in the frames of both its links: even joints yaw, odd joints pitch.
-fn axis(robot: &Robot, joint: usize) -> Vector {
-    if (joint % robot.links_per_module).is_multiple_of(2) { Vector::Z } else { Vector::Y }
 }

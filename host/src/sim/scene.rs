@@ -46,10 +46,16 @@ pub struct Scene {
 }
 
 impl Block {
+    /// Its rotation at the start, quaternion x, y, z, w.
+    pub fn rotation(&self) -> [f32; 4] {
+        let (sin, cos) = libm::sincosf(0.5 * self.yaw);
+        [0.0, 0.0, sin, cos]
+    }
+
     /// Moments of inertia about its own axes, kg units^2: those of a box that is as heavy everywhere.
     pub fn moments(&self) -> [f32; 3] {
-        let [x, y, z] = self.half.map(|h| h * h * self.mass / 3.0);
-        [y + z, x + z, x + y]
+        let ([x, y, z], third) = (self.half.map(|h| h * h), self.mass / 3.0);
+        [y + z, x + z, x + y].map(|squares| squares * third)
     }
 }
 

@@ -184,9 +184,16 @@ fn crc(image: &[u8]) -> u32 {
     Policy::parse(image).map_or(0, |policy| policy.crc())
 }
 
-/// What an evaluation depends on besides the policy: robot, task, delay.
+/// What an evaluation depends on besides the policy: robot, task, delay, sensors.
 pub(super) fn world(env: &crate::env::EnvConfig) -> u32 {
-    let text = format!("{} {:08x} {:?} {:?}", env.robot.fingerprint(), env.task.digest(), env.delay, env.relax_seconds);
+    let text = format!(
+        "{} {:08x} {:?} {:?} {:?}",
+        env.robot.fingerprint(),
+        env.task.digest(),
+        env.delay,
+        env.relax_seconds,
+        env.sensors
+    );
     crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(text.as_bytes())
 }
 
