@@ -1,7 +1,7 @@
 #![deny(unsafe_code)]
 //! A simulated CAN bus in virtual time with the modules of a snake robot as its nodes.
 //!
-//! [`bus`] is the bus, with [`frame_bits`] for the length of frames and [`faults`] for what goes wrong; [`candump`] writes and
+//! [`bus`] is the bus, with [`frame_bits`] for the length of frames, [`confinement`] for its error counters and [`faults`] for what goes wrong; [`candump`] writes and
 //! reads its logs. [`sil`] puts complete firmware controllers and the ground station ([`station`]) on it and lets them control
 //! anything that implements [`Plant`]. A module's controller runs in this process or elsewhere ([`computer`], [`remote`]), above all in an
 //! emulated microcontroller ([`qemu`]), and the plant may be in another process too ([`external_plant`]). [`sensor_model`] makes of the true state
@@ -10,6 +10,7 @@
 pub mod bus;
 pub mod candump;
 pub mod computer;
+pub mod confinement;
 pub mod external_plant;
 pub mod faults;
 pub mod frame_bits;
