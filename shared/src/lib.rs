@@ -14,5 +14,6 @@ pub mod nn;
 pub mod observation;
 pub mod policies;
 pub mod policy;
+pub mod registers;
 pub mod robot;
 pub mod wire;
