@@ -5,7 +5,8 @@
 //! reads its logs. [`sil`] puts complete firmware controllers and the ground station ([`station`]) on it and lets them control
 //! anything that implements [`Plant`]. A module's controller runs in this process or elsewhere ([`computer`], [`remote`]), above all in an
 //! emulated microcontroller ([`qemu`]), and the plant may be in another process too ([`external_plant`]). [`sensor_model`] makes of the true state
-//! of a module what its chips read. Nothing here depends on wall-clock time: the same seed gives the same run, bit for bit.
+//! of a module what its chips read. Nothing of these depends on wall-clock time: the same seed gives the same run, bit for bit. [`live`] is the
+//! exception: it lets a run keep pace with the clock on the wall and offers its bus on a pseudo-terminal, in the text protocol [`slcan`].
 
 pub mod bus;
 pub mod candump;
@@ -14,11 +15,14 @@ pub mod confinement;
 pub mod external_plant;
 pub mod faults;
 pub mod frame_bits;
+#[cfg(unix)]
+pub mod live;
 pub mod plant;
 pub mod qemu;
 pub mod remote;
 pub mod sensor_model;
 pub mod sil;
+pub mod slcan;
 pub mod station;
 
 pub use plant::Plant;

@@ -15,7 +15,7 @@
 //!   [`Sensors::ZERO`], with a stuck one always the same sample.
 //!
 //! The line is the station, then the modules from the head to the tail (the station elsewhere with [`SilConfig::station_behind`]), then, only
-//! if there are frames to inject, a foreign node. Everything follows from the plant, the policy image and the configuration: the same
+//! if there are frames to inject, a foreign node, then the nodes that somebody [`Outside`] plays. Without those everything follows from the plant, the policy image and the configuration: the same
 //! ones give the same run, bit for bit.
 
 use std::collections::VecDeque;
@@ -91,6 +91,39 @@ pub struct Injected {
     pub frame: Frame,
 }
 
+/// Somebody outside of the simulation who takes part in a run: nodes at the tail end of the cable, and how fast time goes.
+pub trait Outside {
+    /// How many nodes it plays.
+    fn nodes(&self) -> usize;
+
+    /// The simulation is at `now` and will go on at `next` (ns) if nobody sends anything before. This may take its time.
+    fn wait(&mut self, now: u64, next: u64) -> Turn;
+
+    /// Node `node` of those it plays, from 0, has received a frame that another node sent.
+    fn hear(&mut self, node: usize, frame: &Frame);
+}
+
+/// What somebody [`Outside`] does next.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Turn {
+    /// Nothing until then.
+    GoOn,
+    /// One of its nodes sends a frame.
+    Send {
+        /// Which node, from 0.
+        node: usize,
+        /// When, ns; held within the time that was asked for.
+        at_ns: u64,
+        /// What.
+        frame: Frame,
+    },
+    /// The run is to end.
+    End,
+}
+
+/// Frames that may wait for a mailbox of a node [`Outside`]; more are lost, as in an adapter.
+const OUTSIDE_QUEUE: usize = 1024;
+
 /// How a run is set up.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SilConfig {
@@ -113,6 +146,8 @@ pub struct SilConfig {
     pub clocks: Vec<Clock>,
     /// Configured numbers of the modules, head first; those not listed have the right one.
     pub numbers: Vec<u8>,
+    /// Whether there is a station. Without one nobody tells the robot anything, unless somebody [`Outside`] does.
+    pub station: bool,
     /// Number of modules between the head end of the cable and the station: 0 puts it at the head end.
     pub station_behind: usize,
     /// Stops and releases that the station sends, with their times in ns.
@@ -140,6 +175,7 @@ impl SilConfig {
             station_latency_us: 50,
             clocks: Vec::new(),
             numbers: Vec::new(),
+            station: true,
             station_behind: 0,
             commands: Vec::new(),
             injected: Vec::new(),
@@ -354,6 +390,10 @@ struct Engine<'c, L: Launcher> {
     active: Vec<Fault>,
     next_command: usize,
     next_injected: usize,
+    /// The first of the nodes that somebody outside plays.
+    outside_node: usize,
+    /// Their frames that wait for a mailbox.
+    outside_waiting: VecDeque<(usize, Frame)>,
     /// The earliest of the modules' next polls.
     next_poll_ns: u64,
 }
@@ -379,6 +419,19 @@ pub fn run_on<P: Plant + ?Sized, L: Launcher>(
     plant: &mut P,
     policy: Policy<'_>,
     config: &SilConfig,
+    capture: Option<&mut dyn Write>,
+    observer: &mut dyn FnMut(&CycleView<'_>, &P),
+) -> Result<SilReport, SilError> {
+    run_with(launcher, plant, policy, config, None, capture, observer)
+}
+
+/// The same with somebody outside who takes part, until the plant is done or they end it.
+pub fn run_with<P: Plant + ?Sized, L: Launcher>(
+    launcher: &L,
+    plant: &mut P,
+    policy: Policy<'_>,
+    config: &SilConfig,
+    mut outside: Option<&mut dyn Outside>,
     mut capture: Option<&mut dyn Write>,
     observer: &mut dyn FnMut(&CycleView<'_>, &P),
 ) -> Result<SilReport, SilError> {
@@ -394,13 +447,24 @@ pub fn run_on<P: Plant + ?Sized, L: Launcher>(
     if step_ns == 0 {
         return Err(SilError::Step);
     }
-    let mut engine = Engine::new(config, launcher, policy, count)?;
+    let mut engine =
+        Engine::new(config, launcher, policy, count, outside.as_ref().map_or(0, |outside| outside.nodes()))?;
     let period_ns = u64::from(engine.timing().period_us) * 1000;
     let (mut next_step, mut next_view, mut cycle) = (step_ns, period_ns, 0);
     let mut now = 0;
     while !plant.done() && now < config.limit_ns {
-        let next = engine.next_ns().min(next_step);
-        now = next.min(config.limit_ns);
+        let mut next = engine.next_ns().min(next_step).min(config.limit_ns);
+        if let Some(outside) = &mut outside {
+            match outside.wait(now, next) {
+                Turn::GoOn => {}
+                Turn::Send { node, at_ns, frame } => {
+                    next = at_ns.clamp(now, next);
+                    engine.enqueue_outside(node, frame);
+                }
+                Turn::End => break,
+            }
+        }
+        now = next;
         engine.change_faults(plant, now)?;
         if next_step <= now {
             plant.step();
@@ -416,7 +480,12 @@ pub fn run_on<P: Plant + ?Sized, L: Launcher>(
             }
         }
         engine.send_scripted(now);
+        engine.send_outside(now);
         while let Some(event) = engine.bus.poll(now) {
+            if let (Some(outside), Event::Delivered { frame, receivers, .. }) = (&mut outside, &event) {
+                let first = engine.outside_node;
+                bus::nodes(*receivers).filter(|node| *node >= first).for_each(|node| outside.hear(node - first, frame));
+            }
             engine.handle(plant, &event, &mut capture)?;
         }
         engine.poll_due(plant, now)?;
@@ -425,8 +494,15 @@ pub fn run_on<P: Plant + ?Sized, L: Launcher>(
 }
 
 impl<'c, L: Launcher> Engine<'c, L> {
-    fn new(config: &'c SilConfig, launcher: &'c L, policy: Policy<'c>, count: usize) -> Result<Self, SilError> {
-        let nodes = count + 1 + usize::from(!config.injected.is_empty());
+    fn new(
+        config: &'c SilConfig,
+        launcher: &'c L,
+        policy: Policy<'c>,
+        count: usize,
+        outside: usize,
+    ) -> Result<Self, SilError> {
+        let outside_node = count + 1 + usize::from(!config.injected.is_empty());
+        let nodes = outside_node + outside;
         let bus_config = BusConfig { rates: config.rates, automatic_recovery: config.bus_off == BusOffPolicy::Recover };
         let mut changes = Vec::new();
         for scheduled in &config.faults {
@@ -449,8 +525,13 @@ impl<'c, L: Launcher> Engine<'c, L> {
             active: Vec::new(),
             next_command: 0,
             next_injected: 0,
+            outside_node,
+            outside_waiting: VecDeque::new(),
             next_poll_ns: 0,
         };
+        if !config.station {
+            engine.bus.unplug(0, engine.station_node);
+        }
         for module in 0..count {
             engine.modules.push(Module {
                 controller: None,
@@ -693,6 +774,20 @@ impl<'c, L: Launcher> Engine<'c, L> {
             self.next_injected += 1;
             let _ = self.bus.send(foreign, &injected.frame, now);
         }
+    }
+
+    /// Takes a frame of a node outside; lost if there is no such node, or too many wait.
+    fn enqueue_outside(&mut self, node: usize, frame: Frame) {
+        let node = self.outside_node.saturating_add(node);
+        if node < self.bus.count() && self.outside_waiting.len() < OUTSIDE_QUEUE {
+            self.outside_waiting.push_back((node, frame));
+        }
+    }
+
+    /// Hands frames of the nodes outside to their CAN ports, as many as fit.
+    fn send_outside(&mut self, now: u64) {
+        let bus = &mut self.bus;
+        self.outside_waiting.retain(|(node, frame)| !bus.has_room(*node) || bus.send(*node, frame, now).is_err());
     }
 
     fn handle<P: Plant + ?Sized>(
