@@ -16,10 +16,10 @@ use std::time::{Duration, Instant};
 
 use composer_shared::wire::Frame;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
-use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl};
+use rustix::fs::{Mode, OFlags, fcntl_getfl, fcntl_setfl};
 use rustix::io::Errno;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
-use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
+use rustix::termios::{OptionalActions, QueueSelector, tcflush, tcgetattr, tcsetattr};
 
 use crate::sil::{Outside, Turn};
 use crate::slcan::{Adapter, Lines, Obeyed, REFUSED, Received, write_frame};
@@ -106,10 +106,9 @@ impl Terminal {
                 Err(_) | Ok(0) => {
                     if self.attached {
                         self.attached = false;
-                        self.lines = Lines::default();
-                        self.adapter.close();
+                        self.forget();
                     }
-                    return self.out.clear();
+                    return;
                 }
                 Ok(length) => {
                     self.attached = true;
@@ -126,6 +125,18 @@ impl Terminal {
                     }
                 }
             }
+        }
+    }
+
+    /// Whoever had it open has gone: nothing of it is left for the next one.
+    fn forget(&mut self) {
+        self.lines = Lines::default();
+        self.adapter.close();
+        self.out.clear();
+        // What it did not read waits in the system, at the other end.
+        if let Ok(other) = rustix::fs::open(&self.name, OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK, Mode::empty())
+        {
+            let _ = tcflush(&other, QueueSelector::IFlush);
         }
     }
 
