@@ -9,12 +9,14 @@
 //! [`attitude`] estimates which way is up; [`drivers`] read the sensors and drive the motors over `embedded-hal`; [`node_page`] is what a board knows of itself.
 //!
 //! [`neighbours`] keeps what was heard from the other modules and how fresh it is; [`failsafe`] decides when the motors relax
-//! and why, by what [`limits`], [`supply`] and [`trips`] say of joints, supply and motors, and within the settings of [`safety`]. [`link`] is how an emulated module talks to the simulator.
+//! and why, by what [`limits`], [`supply`] and [`trips`] say of joints, supply and motors, and within the settings of [`safety`]; [`port`] which
+//! frame is sent next. [`link`] is how an emulated module talks to the simulator.
 
 #[cfg(test)]
 extern crate std;
 
 pub mod attitude;
+pub mod budget;
 pub mod controller;
 pub mod drivers;
 pub mod failsafe;
@@ -23,6 +25,7 @@ pub mod link;
 pub mod memory_map;
 pub mod neighbours;
 pub mod node_page;
+pub mod port;
 pub mod safety;
 pub mod supply;
 pub mod trips;
