@@ -27,5 +27,6 @@ pub mod neighbours;
 pub mod node_page;
 pub mod port;
 pub mod safety;
+pub mod storage;
 pub mod supply;
 pub mod trips;

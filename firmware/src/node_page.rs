@@ -55,7 +55,7 @@ const MOTOR_SIZE: usize = 7 * 4;
 const CRC_AT: usize = MOTORS_AT + MOTOR_SIZE * AXES;
 const _: () = assert!(CRC_AT + 4 == SIZE);
 
-const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
+pub(crate) const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
 
 /// How far the rows of a rotation may be from orthonormal.
 const ORTHONORMAL: f32 = 1e-3;
@@ -314,13 +314,13 @@ fn is_rotation(rows: &[[f32; 3]; 3]) -> bool {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use proptest::prelude::*;
     use std::string::ToString;
     use std::vec::Vec;
 
-    fn page() -> NodePage {
+    pub fn page() -> NodePage {
         let motor = MotorCalibration {
             torque_constant: 80.0,
             current_limit: 1.2,
