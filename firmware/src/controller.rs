@@ -44,7 +44,7 @@ use composer_shared::policy::{Encoded, GoalKnownTo, Policy};
 use composer_shared::robot::{AXES, Limits, ROOM};
 use composer_shared::wire::{
     EmergencyStop, FRAGMENTS, Frame, Goal, Health, Heartbeat, LatentMessage, Message, Mode, NOBODY, PROTOCOL_VERSION,
-    STATION, State, StopCommand, Sync, Telemetry, quantise_angle,
+    STATION, State, StopCommand, StopCount, Sync, Telemetry, quantise_angle,
 };
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
@@ -509,7 +509,7 @@ impl<'a> Controller<'a> {
     /// The motors relax with the next poll.
     pub fn emergency_stop(&mut self) {
         self.failsafe.stop();
-        self.outbox.stop = Some(EmergencyStop::new(StopCommand::Stop, 0));
+        self.outbox.stop = Some(EmergencyStop::new(StopCommand::Stop, 0, StopCount::UNKNOWN));
     }
 
     /// The active faults.
@@ -663,7 +663,10 @@ impl<'a> Controller<'a> {
         self.last_heard = self.now;
         self.neighbours.hear(module);
         let heard = match message {
-            Message::EmergencyStop(_) | Message::Telemetry(_) => Heard::Now,
+            Message::EmergencyStop(_)
+            | Message::Telemetry(_)
+            | Message::ServiceRequest(_)
+            | Message::ServiceResponse(_) => Heard::Now,
             Message::Sync(sync) => self.hear_sync(module, sync, sensors),
             Message::Goal(goal) => self.hear_goal(goal),
             Message::State(state) => {
@@ -764,7 +767,7 @@ impl<'a> Controller<'a> {
                 Some(start) if now.saturating_sub(start) < period / 2 => {
                     self.next_sync = Some(start.saturating_add(period));
                     self.last_sync = now;
-                    self.outbox.sync = Some(Sync::new(self.cycle, self.alive_count()));
+                    self.outbox.sync = Some(Sync::new(self.cycle, self.alive_count(), self.config.modules));
                 }
                 start => {
                     // The lost time-keeper's numbers go on, so that modules that follow it without SYNC agree.
@@ -786,7 +789,7 @@ impl<'a> Controller<'a> {
 
     fn send_sync(&mut self, cycle: u16, sensors: &Sensors) {
         self.last_sync = self.now;
-        self.outbox.sync = Some(Sync::new(cycle, self.alive_count()));
+        self.outbox.sync = Some(Sync::new(cycle, self.alive_count(), self.config.modules));
         self.start_cycle(cycle, sensors);
     }
 

@@ -28,7 +28,7 @@ const COOL_DOWN: f32 = 5.0;
 
 /// A set of faults.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct FaultSet(u16);
+pub struct FaultSet(u32);
 
 impl FaultSet {
     /// None.
@@ -72,9 +72,9 @@ impl FaultSet {
     }
 }
 
-const fn bit(fault: Fault) -> u16 {
-    // Fault numbers start at 32 and there are fewer than 16.
-    1 << (fault as u16 & 15)
+const fn bit(fault: Fault) -> u32 {
+    // Fault numbers start at 32, and there are fewer than 32.
+    1 << (fault as u32 & 31)
 }
 
 /// How the CAN controller is (ISO 11898-1 fault confinement).
@@ -243,7 +243,7 @@ mod tests {
 
     #[test]
     fn every_fault_has_its_own_bit() {
-        let mut seen = 0u16;
+        let mut seen = 0u32;
         for fault in Fault::ALL {
             assert_eq!(seen & bit(fault), 0);
             seen |= bit(fault);

@@ -148,7 +148,7 @@ pub struct Status {
 impl Status {
     /// What the module is at; `None` if no mode has this number.
     pub fn mode(&self) -> Option<Mode> {
-        [Mode::Boot, Mode::Active, Mode::Relaxed, Mode::Alone].into_iter().find(|mode| *mode as u8 == self.mode)
+        Mode::from_number(self.mode)
     }
 }
 

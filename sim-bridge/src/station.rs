@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use composer_shared::wire::{EmergencyStop, Frame, Goal, Message, STATION, StopCommand};
+use composer_shared::wire::{EmergencyStop, Frame, Goal, Message, STATION, StopCommand, StopCount};
 
 /// A ground station without I/O. It answers the SYNC of each control cycle with the GOAL frames of that cycle, one for each point of
 /// the scene.
@@ -33,7 +33,7 @@ impl Station {
 
     /// The frame that stops all modules, or releases them again.
     pub fn command(&self, command: StopCommand) -> Frame {
-        Message::EmergencyStop(EmergencyStop::new(command, 0)).emit(STATION, self.fd)
+        Message::EmergencyStop(EmergencyStop::new(command, 0, StopCount::UNKNOWN)).emit(STATION, self.fd)
     }
 }
 
@@ -45,7 +45,7 @@ mod tests {
     #[test]
     fn each_cycle_is_answered_once() {
         let mut station = Station::new(true, 3);
-        let sync = |cycle| Message::Sync(Sync::new(cycle, 8)).emit(0, true);
+        let sync = |cycle| Message::Sync(Sync::new(cycle, 8, 8)).emit(0, true);
         let frames = station.receive(&sync(300), |n| (n != 1).then_some([1.0, 2.0, -f32::from(n)])).unwrap();
         let goals = frames.iter().map(|frame| match Message::parse(frame) {
             Ok(Message::Goal(goal)) => (goal.cycle, goal.point(), goal.position()),

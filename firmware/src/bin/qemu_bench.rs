@@ -184,7 +184,7 @@ fn control_steps(policy: Policy<'_>, modules: u8, random: &mut Random) {
     let config = Config::new(node, modules, BusKind::Fd, &policy);
     let period = config.timing.period_us;
     let Ok(mut controller) = Controller::new(config, policy, 0) else { return };
-    let empty = Message::Sync(Sync::new(0, 0)).emit(0, true);
+    let empty = Message::Sync(Sync::new(0, 0, 1)).emit(0, true);
     let mut frames = [empty; FRAMES];
     let (mut sum, mut most) = (0u64, 0);
     for cycle in 0..CYCLES {
@@ -196,7 +196,7 @@ fn control_steps(policy: Policy<'_>, modules: u8, random: &mut Random) {
             frames[received] = message.emit(module, true);
             received += 1;
         };
-        put(Message::Sync(Sync::new(cycle, modules)), 0);
+        put(Message::Sync(Sync::new(cycle, modules, modules)), 0);
         put(Message::Goal(Goal::new(low, 0, Some([12.0, -3.0, 0.5]))), STATION);
         for module in 0..node {
             let angles = [(); 4].map(|()| random.angle());

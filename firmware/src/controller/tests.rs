@@ -138,7 +138,7 @@ impl Net {
     }
 
     fn station_says(&mut self, command: StopCommand) {
-        self.inject(Message::EmergencyStop(EmergencyStop::new(command, 0)).emit(STATION, true));
+        self.inject(Message::EmergencyStop(EmergencyStop::new(command, 0, StopCount::UNKNOWN)).emit(STATION, true));
     }
 
     fn settle(&mut self) {
@@ -470,7 +470,7 @@ fn without_any_sync_the_motors_relax_and_a_sync_brings_them_back() {
     config.timing.takeover_periods = 50;
     let mut module = Controller::new(config, policy, 0).unwrap();
     let mut now = 0;
-    let sync = |cycle| Message::Sync(Sync::new(cycle, 8)).emit(0, true);
+    let sync = |cycle| Message::Sync(Sync::new(cycle, 8, 8)).emit(0, true);
     let goal = Message::Goal(Goal::new(0, 0, None)).emit(STATION, true);
     module.poll(now, &level(), Some(&sync(1)), BusStatus::ErrorActive);
     let mut relaxed_at = None;
@@ -500,8 +500,8 @@ fn a_babbling_time_keeper_does_not_drive_the_cycle() {
     let cycles = net.at(5).stats().cycles;
     for _ in 0..200 {
         let cycle = net.at(5).cycle();
-        net.inject(Message::Sync(Sync::new(cycle.wrapping_add(1), 8)).emit(0, true));
-        net.inject(Message::Sync(Sync::new(cycle.wrapping_sub(1), 8)).emit(0, true));
+        net.inject(Message::Sync(Sync::new(cycle.wrapping_add(1), 8, 8)).emit(0, true));
+        net.inject(Message::Sync(Sync::new(cycle.wrapping_sub(1), 8, 8)).emit(0, true));
         net.run(500);
     }
     // Two periods went by; four times the beat is the most that can be forced.
@@ -706,7 +706,7 @@ fn an_emergency_stop_latches_in_the_same_poll_until_the_station_releases_it() {
     // The cycle goes on: the robot can be watched.
     assert_eq!(net.at(3).heard(), 0xff);
     // A module cannot release; a module that comes in does not move either.
-    net.inject(Frame::new(0x001, true, &[2, 0]).unwrap());
+    net.inject(Frame::new(0x001, true, &[2, 0, 0]).unwrap());
     net.unplug(3);
     net.run(SECOND);
     net.plug(3);
@@ -731,7 +731,7 @@ fn any_module_can_stop_all() {
     // Modules that this robot does not have may stop it, too.
     net.station_says(StopCommand::Release);
     net.run(PERIOD);
-    net.inject(Message::EmergencyStop(EmergencyStop::new(StopCommand::Stop, 0)).emit(40, true));
+    net.inject(Message::EmergencyStop(EmergencyStop::new(StopCommand::Stop, 0, StopCount::UNKNOWN)).emit(40, true));
     assert!(net.outputs.iter().all(|o| !o.motors_enabled));
 }
 
@@ -897,7 +897,7 @@ fn a_controller_is_small() {
 // Anything at all
 
 fn any_frame() -> impl Strategy<Value = Frame> {
-    let function = prop_oneof![8 => 0u16..6, 1 => 6u16..16];
+    let function = prop_oneof![9 => 0u16..8, 1 => 8u16..16];
     let module = prop_oneof![8 => 0u16..5, 1 => 5u16..128, 2 => Just(0x7fu16)];
     let good_len = prop_oneof![Just(true), Just(true), Just(true), Just(false)];
     (function, module, good_len, prop::collection::vec(any::<u8>(), 64), 0u8..4, any::<u8>()).prop_map(
@@ -908,13 +908,16 @@ fn any_frame() -> impl Strategy<Value = Frame> {
                 data[0] = if function == 5 { data[0] & 0x7f } else { near };
                 data[1] &= if function == 1 { 0 } else { 15 };
                 if function == 1 {
-                    data[3] = 0;
+                    data[3] = 5;
+                }
+                if function == 0 {
+                    data[2] &= 15;
                 }
                 data[52..].fill(0);
             }
             let len = match function {
                 _ if !good_len => len,
-                0 => 2,
+                0 => 3,
                 1 => 4,
                 4 => 64,
                 _ => 8,

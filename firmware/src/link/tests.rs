@@ -187,7 +187,7 @@ fn a_module_that_is_started_again_is_a_new_one() {
 fn poll() -> impl Strategy<Value = ToModule> {
     let frame = (0u8..9, 0u8..4, 0u16..6, any::<bool>()).prop_map(|(kind, node, cycle, classic)| {
         let frame = match kind {
-            0..=4 => Message::Sync(Sync::new(cycle, 4)).emit(node, !classic),
+            0..=4 => Message::Sync(Sync::new(cycle, 4, 4)).emit(node, !classic),
             _ => Frame::new(Function::ALL[usize::from(kind) % 8].id(node), !classic, &[cycle as u8; 8]).unwrap(),
         };
         Carried(frame)

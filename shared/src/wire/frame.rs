@@ -4,7 +4,7 @@ use core::fmt;
 
 use crate::robot::MAX_MODULES;
 
-/// The module number of the ground station: it tells the goal and may stop and release the robot.
+/// The module number of the ground station: it tells the goal, arms, asks, and may stop and release the robot.
 pub const STATION: u8 = 0x7f;
 
 /// A CAN or CAN-FD data frame with an 11-bit identifier.
@@ -102,6 +102,10 @@ pub enum Function {
     Latent = 4,
     /// An eighth of it (classic CAN).
     LatentFragment = 5,
+    /// The station asks a module for something, or all of them.
+    ServiceRequest = 6,
+    /// The answer to it.
+    ServiceResponse = 7,
     /// What a module is doing.
     Telemetry = 8,
     /// How a module is.
@@ -110,13 +114,15 @@ pub enum Function {
 
 impl Function {
     /// All of them, most urgent first.
-    pub const ALL: [Function; 8] = [
+    pub const ALL: [Function; 10] = [
         Function::EmergencyStop,
         Function::Sync,
         Function::Goal,
         Function::State,
         Function::Latent,
         Function::LatentFragment,
+        Function::ServiceRequest,
+        Function::ServiceResponse,
         Function::Telemetry,
         Function::Heartbeat,
     ];
@@ -140,6 +146,8 @@ impl Function {
             Function::State => "STATE",
             Function::Latent => "LATENT",
             Function::LatentFragment => "LATENT_FRAGMENT",
+            Function::ServiceRequest => "SERVICE_REQUEST",
+            Function::ServiceResponse => "SERVICE_RESPONSE",
             Function::Telemetry => "TELEMETRY",
             Function::Heartbeat => "HEARTBEAT",
         }
@@ -189,7 +197,7 @@ impl fmt::Display for WireError {
         match *self {
             WireError::Identifier(id) => write!(f, "identifier {id:#x} has more than 11 bits"),
             WireError::UnknownFunction(n) => {
-                write!(f, "function {n} is not part of this protocol, which knows 0 to 5, 8 and 9")
+                write!(f, "function {n} is not part of this protocol, which knows 0 to 9")
             }
             WireError::UnknownModule(m) => {
                 write!(f, "module {m} cannot be: modules are 0 to {}, the station is {STATION}", MAX_MODULES - 1)

@@ -3,8 +3,8 @@
 use core::fmt::{self, Write};
 
 use super::{
-    EmergencyStop, Fault, Fragment, Frame, Function, Goal, Heartbeat, LATENT_SIZE, LatentMessage, STATION, State, Sync,
-    Telemetry,
+    EmergencyStop, Fault, Fragment, Frame, Function, Goal, Heartbeat, LATENT_SIZE, LatentMessage, LimitedBy, Mode,
+    Operation, STATION, ServiceCode, ServiceRequest, ServiceResponse, State, StopCommand, Sync, Telemetry,
 };
 use crate::robot::MAX_MODULES;
 
@@ -76,18 +76,18 @@ const fn signed(name: &'static str, count: u8, bits: u8, scale: f64, unit: &'sta
 }
 
 /// All frames, most urgent first.
-pub const LAYOUTS: [Layout; 8] = [
+pub const LAYOUTS: [Layout; 10] = [
     Layout {
         function: Function::EmergencyStop,
         senders: Senders::Both,
-        size: 2,
-        fields: &[unsigned("command", 8), unsigned("reason", 8)],
+        size: 3,
+        fields: &[unsigned("command", 8), unsigned("reason", 8), unsigned("counter", 8)],
     },
     Layout {
         function: Function::Sync,
         senders: Senders::Modules,
         size: 4,
-        fields: &[unsigned("cycle", 16), unsigned("alive", 8), unsigned("reserved", 8)],
+        fields: &[unsigned("cycle", 16), unsigned("alive", 8), unsigned("modules", 8)],
     },
     Layout {
         function: Function::Goal,
@@ -134,6 +134,30 @@ pub const LAYOUTS: [Layout; 8] = [
         ],
     },
     Layout {
+        function: Function::ServiceRequest,
+        senders: Senders::Station,
+        size: 8,
+        fields: &[
+            unsigned("destination", 8),
+            unsigned("operation", 8),
+            unsigned("sequence", 8),
+            unsigned("index", 8),
+            unsigned("value", 32),
+        ],
+    },
+    Layout {
+        function: Function::ServiceResponse,
+        senders: Senders::Modules,
+        size: 8,
+        fields: &[
+            unsigned("operation", 8),
+            unsigned("sequence", 8),
+            unsigned("code", 8),
+            unsigned("index", 8),
+            unsigned("value", 32),
+        ],
+    },
+    Layout {
         function: Function::Telemetry,
         senders: Senders::Modules,
         size: 8,
@@ -172,8 +196,10 @@ pub(super) fn of(function: Function) -> &'static Layout {
         Function::State => &LAYOUTS[3],
         Function::Latent => &LAYOUTS[4],
         Function::LatentFragment => &LAYOUTS[5],
-        Function::Telemetry => &LAYOUTS[6],
-        Function::Heartbeat => &LAYOUTS[7],
+        Function::ServiceRequest => &LAYOUTS[6],
+        Function::ServiceResponse => &LAYOUTS[7],
+        Function::Telemetry => &LAYOUTS[8],
+        Function::Heartbeat => &LAYOUTS[9],
     }
 }
 
@@ -196,19 +222,23 @@ const _: () = {
     check(3, Function::State, size_of::<State>());
     check(4, Function::Latent, size_of::<LatentMessage>());
     check(5, Function::LatentFragment, size_of::<Fragment>());
-    check(6, Function::Telemetry, size_of::<Telemetry>());
-    check(7, Function::Heartbeat, size_of::<Heartbeat>());
+    check(6, Function::ServiceRequest, size_of::<ServiceRequest>());
+    check(7, Function::ServiceResponse, size_of::<ServiceResponse>());
+    check(8, Function::Telemetry, size_of::<Telemetry>());
+    check(9, Function::Heartbeat, size_of::<Heartbeat>());
 };
 
 /// Writes a DBC file of all frames of a robot with `modules` modules and its station, for candump users' tools (cantools,
-/// SavvyCAN, Kayak). Frames with more than 8 bytes are marked as CAN-FD with bit-rate switch (`VFrameFormat` 14).
-pub fn dbc(out: &mut impl Write, modules: u8) -> fmt::Result {
+/// SavvyCAN, Kayak). On a CAN-FD bus (`fd`) every frame is an FD frame with bit-rate switch (`VFrameFormat` 14), the short ones
+/// too; on a classic bus there is no LATENT, and on an FD bus no LATENT_FRAGMENT.
+pub fn dbc(out: &mut impl Write, modules: u8, fd: bool) -> fmt::Result {
     let modules = modules.min(MAX_MODULES as u8);
     out.write_str("VERSION \"\"\n\nNS_ :\n\nBS_:\n\nBU_: STATION")?;
     (0..modules).try_for_each(|m| write!(out, " M{m}"))?;
     out.write_str("\n")?;
+    let foreign = if fd { Function::LatentFragment } else { Function::Latent };
     let frames = || {
-        LAYOUTS.iter().flat_map(move |layout| {
+        LAYOUTS.iter().filter(move |layout| layout.function != foreign).flat_map(move |layout| {
             let senders = (0..modules).chain([STATION]);
             senders.filter(|m| layout.senders.may_send(*m)).map(move |m| (layout, m))
         })
@@ -244,16 +274,50 @@ pub fn dbc(out: &mut impl Write, modules: u8) -> fmt::Result {
     (2..14).try_for_each(|_| out.write_str(",\"reserved\""))?;
     out.write_str(",\"StandardCAN_FD\",\"ExtendedCAN_FD\";\n")?;
     out.write_str("BA_DEF_DEF_ \"BusType\" \"CAN\";\nBA_DEF_DEF_ \"VFrameFormat\" \"StandardCAN\";\n")?;
-    out.write_str("BA_ \"BusType\" \"CAN FD\";\n")?;
-    for (layout, module) in frames().filter(|(layout, _)| layout.wire_len() > 8) {
-        writeln!(out, "BA_ \"VFrameFormat\" BO_ {} 14;", layout.function.id(module))?;
+    if fd {
+        out.write_str("BA_ \"BusType\" \"CAN FD\";\n")?;
+        frames().try_for_each(|(layout, m)| writeln!(out, "BA_ \"VFrameFormat\" BO_ {} 14;", layout.function.id(m)))?;
     }
-    for (layout, module) in frames().filter(|(layout, _)| layout.function == Function::Heartbeat) {
+    for (layout, module) in frames() {
         let id = layout.function.id(module);
-        writeln!(out, "VAL_ {id} mode 0 \"boot\" 1 \"active\" 2 \"relaxed\" 3 \"alone\" ;")?;
-        write!(out, "VAL_ {id} fault 0 \"none\"")?;
-        Fault::ALL.into_iter().try_for_each(|f| write!(out, " {} \"{f:?}\"", f as u8))?;
-        out.write_str(" ;\n")?;
+        match layout.function {
+            Function::EmergencyStop => {
+                let (stop, release) = (StopCommand::Stop as u8, StopCommand::Release as u8);
+                writeln!(out, "VAL_ {id} command {stop} \"stop\" {release} \"release\" ;")?;
+                faults(out, id, "reason")?;
+            }
+            Function::ServiceRequest => operations(out, id)?,
+            Function::ServiceResponse => {
+                operations(out, id)?;
+                write!(out, "VAL_ {id} code")?;
+                ServiceCode::ALL.into_iter().try_for_each(|c| write!(out, " {} \"{c:?}\"", c as u8))?;
+                out.write_str(" ;\n")?;
+            }
+            Function::Telemetry => {
+                write!(out, "VAL_ {id} limited_by")?;
+                LimitedBy::ALL.into_iter().try_for_each(|l| write!(out, " {} \"{l:?}\"", l as u8))?;
+                out.write_str(" ;\n")?;
+            }
+            Function::Heartbeat => {
+                write!(out, "VAL_ {id} mode")?;
+                Mode::ALL.into_iter().try_for_each(|m| write!(out, " {} \"{}\"", m as u8, m.name()))?;
+                out.write_str(" ;\n")?;
+                faults(out, id, "fault")?;
+            }
+            _ => {}
+        }
     }
     Ok(())
+}
+
+fn faults(out: &mut impl Write, id: u16, field: &str) -> fmt::Result {
+    write!(out, "VAL_ {id} {field} 0 \"none\"")?;
+    Fault::ALL.into_iter().try_for_each(|f| write!(out, " {} \"{f:?}\"", f as u8))?;
+    out.write_str(" ;\n")
+}
+
+fn operations(out: &mut impl Write, id: u16) -> fmt::Result {
+    write!(out, "VAL_ {id} operation")?;
+    Operation::ALL.into_iter().try_for_each(|o| write!(out, " {} \"{}\"", o as u8, o.name()))?;
+    out.write_str(" ;\n")
 }

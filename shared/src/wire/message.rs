@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
-use super::{Frame, Function, STATION, WireError};
+use super::{Frame, Function, STATION, ServiceRequest, ServiceResponse, StopCount, WireError};
 use crate::robot::{AXES, MAX_JOINTS, MAX_MODULES};
 
 /// One step of a joint angle in STATE, rad.
@@ -29,7 +29,7 @@ fn angle_steps(angle: f32) -> i16 {
     libm::roundf((angle / ANGLE_LSB).clamp(-2048.0, 2047.0)) as i16
 }
 
-/// How a module is, in one byte.
+/// How a module is, in one byte: four flags, and the count of the last stop or release that it knows of ([`StopCount`]).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Health(pub u8);
 
@@ -42,8 +42,6 @@ impl Health {
     pub const EMERGENCY_STOP: Health = Health(4);
     /// Bit 3: a numbered fault is active, see its HEARTBEAT.
     pub const FAULT: Health = Health(8);
-    /// Bits 4 to 7 are reserved and zero.
-    const RESERVED: u8 = 0xf0;
 
     /// Both.
     #[must_use]
@@ -65,6 +63,17 @@ impl Health {
     pub const fn motors_enabled(self) -> bool {
         self.has(Health::MOTORS_ENABLED)
     }
+
+    /// The same with the stop count in bits 4 to 7.
+    #[must_use]
+    pub const fn with_stop_count(self, count: StopCount) -> Health {
+        Health(self.0 & 0x0f | count.number() << 4)
+    }
+
+    /// The stop or release that it knows of: bits 4 to 7.
+    pub const fn stop_count(self) -> StopCount {
+        StopCount::new(self.0 >> 4)
+    }
 }
 
 /// What an EMERGENCY_STOP frame asks for.
@@ -84,17 +93,24 @@ pub struct EmergencyStop {
     command: u8,
     /// The number of the fault that made the sender stop; 0: somebody asked for it.
     pub reason: u8,
+    /// Which stop or release of this robot it is.
+    counter: u8,
 }
 
 impl EmergencyStop {
-    /// Stop, or release.
-    pub const fn new(command: StopCommand, reason: u8) -> Self {
-        EmergencyStop { command: command as u8, reason }
+    /// Stop number `count`, or release number `count`.
+    pub const fn new(command: StopCommand, reason: u8, count: StopCount) -> Self {
+        EmergencyStop { command: command as u8, reason, counter: count.number() }
     }
 
     /// What it asks for.
     pub const fn command(&self) -> StopCommand {
         if self.command == StopCommand::Release as u8 { StopCommand::Release } else { StopCommand::Stop }
+    }
+
+    /// Which stop or release it is; [`StopCount::UNKNOWN`]: the sender does not know, and means the next one.
+    pub const fn count(&self) -> StopCount {
+        StopCount::new(self.counter)
     }
 }
 
@@ -106,14 +122,14 @@ pub struct Sync {
     pub cycle: u16,
     /// Modules that the time-keeper believes alive, itself included.
     pub alive: u8,
-    /// Reserved, zero.
-    reserved: u8,
+    /// Modules that the time-keeper believes the robot to have, plugged in or not.
+    pub modules: u8,
 }
 
 impl Sync {
     /// The start of a cycle.
-    pub const fn new(cycle: u16, alive: u8) -> Self {
-        Sync { cycle, alive, reserved: 0 }
+    pub const fn new(cycle: u16, alive: u8, modules: u8) -> Self {
+        Sync { cycle, alive, modules }
     }
 }
 
@@ -224,12 +240,7 @@ impl LatentMessage {
         if padding.iter().any(|b| *b != 0) {
             return Err(WireError::ReservedBits(function));
         }
-        let latent: LatentMessage = decode(function, body)?;
-        latent.check(function)
-    }
-
-    fn check(self, function: Function) -> Result<Self, WireError> {
-        if self.health.0 & Health::RESERVED == 0 { Ok(self) } else { Err(WireError::ReservedBits(function)) }
+        decode(function, body)
     }
 }
 
@@ -259,69 +270,6 @@ impl Fragment {
     }
 }
 
-/// What holds a module's torque back (numbers as in moteus: from 96 on). None of these is a fault.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[repr(u8)]
-pub enum LimitedBy {
-    /// The policy gets what it asks for.
-    Nothing = 0,
-    /// The torque limit.
-    Torque = 96,
-    /// The slew limit.
-    Slew = 97,
-    /// A joint at its end: the torque that would bend it further is held at zero.
-    JointAngle = 98,
-    /// The motors are relaxed.
-    Relaxed = 99,
-}
-
-/// What is wrong with a module (numbers as in moteus: from 32 on; they never change their meaning).
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-#[repr(u8)]
-pub enum Fault {
-    /// An emergency stop is latched. Relaxes. Cleared by a release from the station.
-    EmergencyStop = 32,
-    /// The controller was not polled in time: the processor was overloaded or hung. Relaxes. Cleared by a release or a restart.
-    Watchdog = 33,
-    /// No cycle was started for too long. Relaxes. Clears itself with the next SYNC.
-    SyncLost = 34,
-    /// Another node sends under this module's number. Relaxes and falls silent. Cleared by a restart only.
-    DuplicateNode = 35,
-    /// A neighbour runs another policy; its latents are ignored. Clears itself when that neighbour is silent or agrees.
-    PolicyMismatch = 36,
-    /// A motor is too hot. Relaxes. Clears itself once the motor is well below the limit.
-    OverTemperature = 37,
-    /// A joint is beyond its limit; torque that would bend it further is held at zero. Clears itself.
-    JointAngle = 38,
-    /// The sensors read what cannot be true; the neighbours ignore this module. Clears itself.
-    Sensors = 39,
-    /// The CAN controller went bus-off. Clears itself on recovery or is latched until a restart, by configuration.
-    BusOff = 40,
-    /// Nobody was heard for too long. Relaxes. Clears itself with the next frame heard.
-    Isolated = 41,
-}
-
-impl Fault {
-    /// All of them.
-    pub const ALL: [Fault; 10] = [
-        Fault::EmergencyStop,
-        Fault::Watchdog,
-        Fault::SyncLost,
-        Fault::DuplicateNode,
-        Fault::PolicyMismatch,
-        Fault::OverTemperature,
-        Fault::JointAngle,
-        Fault::Sensors,
-        Fault::BusOff,
-        Fault::Isolated,
-    ];
-
-    /// The fault with this number.
-    pub fn from_number(number: u8) -> Option<Self> {
-        Self::ALL.into_iter().find(|f| *f as u8 == number)
-    }
-}
-
 /// TELEMETRY: what a module is doing.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Telemetry {
@@ -329,7 +277,7 @@ pub struct Telemetry {
     pub torque: [i8; AXES],
     /// Motor temperature, degrees Celsius, held within -128 and 127.
     pub temperature: i8,
-    /// What holds the torque back ([`LimitedBy`]).
+    /// What holds the torque back ([`super::LimitedBy`]).
     pub limited_by: u8,
     /// Modules attended over in the last cycle, the own one included.
     pub heard: u8,
@@ -349,10 +297,40 @@ pub enum Mode {
     Boot = 0,
     /// Taking part in the control cycle, motors on.
     Active = 1,
-    /// Taking part, motors relaxed (see the fault).
+    /// Armed and taking part, motors relaxed (see the fault).
     Relaxed = 2,
     /// Hears nobody, acts alone for a while.
     Alone = 3,
+    /// Taking part, motors relaxed until the station arms the module.
+    Disarmed = 4,
+    /// An emergency stop is latched: motors relaxed, and not to be armed before a release.
+    Stopped = 5,
+    /// Disarmed, and one axis moves as the station asks for it.
+    Service = 6,
+}
+
+impl Mode {
+    /// All of them.
+    pub const ALL: [Mode; 7] =
+        [Mode::Boot, Mode::Active, Mode::Relaxed, Mode::Alone, Mode::Disarmed, Mode::Stopped, Mode::Service];
+
+    /// The mode with this number.
+    pub fn from_number(number: u8) -> Option<Self> {
+        Self::ALL.into_iter().find(|mode| *mode as u8 == number)
+    }
+
+    /// Its name, in lower case.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Mode::Boot => "boot",
+            Mode::Active => "active",
+            Mode::Relaxed => "relaxed",
+            Mode::Alone => "alone",
+            Mode::Disarmed => "disarmed",
+            Mode::Stopped => "stopped",
+            Mode::Service => "service",
+        }
+    }
 }
 
 /// HEARTBEAT: how a module is, also when its motors are relaxed.
@@ -360,7 +338,7 @@ pub enum Mode {
 pub struct Heartbeat {
     /// What the module is at ([`Mode`]).
     pub mode: u8,
-    /// The most serious active fault (lowest number of [`Fault`]), or 0.
+    /// The most serious active fault (lowest number of [`super::Fault`]), or 0.
     pub fault: u8,
     /// How it is.
     pub health: Health,
@@ -391,6 +369,10 @@ pub enum Message {
     Latent(LatentMessage),
     /// A piece of a latent.
     LatentFragment(Fragment),
+    /// The station asks for something.
+    ServiceRequest(ServiceRequest),
+    /// A module answers.
+    ServiceResponse(ServiceResponse),
     /// What a module is doing.
     Telemetry(Telemetry),
     /// How a module is.
@@ -407,6 +389,8 @@ impl Message {
             Message::State(_) => Function::State,
             Message::Latent(_) => Function::Latent,
             Message::LatentFragment(_) => Function::LatentFragment,
+            Message::ServiceRequest(_) => Function::ServiceRequest,
+            Message::ServiceResponse(_) => Function::ServiceResponse,
             Message::Telemetry(_) => Function::Telemetry,
             Message::Heartbeat(_) => Function::Heartbeat,
         }
@@ -423,6 +407,8 @@ impl Message {
             Message::State(m) => encode_into(m, &mut data),
             Message::Latent(m) => encode_into(m, &mut data),
             Message::LatentFragment(m) => encode_into(m, &mut data),
+            Message::ServiceRequest(m) => encode_into(m, &mut data),
+            Message::ServiceResponse(m) => encode_into(m, &mut data),
             Message::Telemetry(m) => encode_into(m, &mut data),
             Message::Heartbeat(m) => encode_into(m, &mut data),
         };
@@ -457,8 +443,9 @@ impl Message {
         }
         let reserved = |set: u8| if set == 0 { Ok(()) } else { Err(WireError::ReservedBits(function)) };
         let wrong = |field, value| Err(WireError::WrongValue { function, field, value });
-        let module_or_nobody = |field, value: u8| {
-            if usize::from(value) < MAX_MODULES || value == NOBODY { Ok(()) } else { wrong(field, value) }
+        let module_or_none = |field, value: u8| {
+            let possible = usize::from(value) < MAX_MODULES || value == NOBODY;
+            if possible { Ok(()) } else { Err(WireError::WrongValue { function, field, value }) }
         };
         Ok(match function {
             Function::EmergencyStop => {
@@ -467,38 +454,44 @@ impl Message {
                     1 => {}
                     2 if module == STATION => {}
                     2 => return Err(WireError::WrongSender { function, module }),
-                    value => return Err(WireError::WrongValue { function, field: "command", value }),
+                    value => return wrong("command", value),
+                }
+                if m.counter > StopCount::LAST {
+                    return wrong("counter", m.counter);
                 }
                 Message::EmergencyStop(m)
             }
             Function::Sync => {
                 let m: Sync = decode(function, body)?;
-                reserved(m.reserved)?;
+                if m.modules == 0 || usize::from(m.modules) > MAX_MODULES {
+                    return wrong("modules", m.modules);
+                }
                 Message::Sync(m)
             }
             Function::Goal => Message::Goal(decode(function, body)?),
-            Function::State => {
-                let m: State = decode(function, body)?;
-                reserved(m.health.0 & Health::RESERVED)?;
-                Message::State(m)
-            }
-            Function::Latent => Message::Latent(decode::<LatentMessage>(function, body)?.check(function)?),
+            Function::State => Message::State(decode(function, body)?),
+            Function::Latent => Message::Latent(decode(function, body)?),
             Function::LatentFragment => {
                 let m: Fragment = decode(function, body)?;
                 reserved(m.header & 0x80)?;
                 Message::LatentFragment(m)
             }
+            Function::ServiceRequest => {
+                let m: ServiceRequest = decode(function, body)?;
+                module_or_none("destination", m.destination)?;
+                Message::ServiceRequest(m)
+            }
+            Function::ServiceResponse => Message::ServiceResponse(decode(function, body)?),
             Function::Telemetry => {
                 let m: Telemetry = decode(function, body)?;
-                module_or_nobody("module", m.attends_to)?;
+                module_or_none("module", m.attends_to)?;
                 Message::Telemetry(m)
             }
             Function::Heartbeat => {
                 let m: Heartbeat = decode(function, body)?;
-                reserved(m.health.0 & Health::RESERVED)?;
-                module_or_nobody("time-keeper", m.time_keeper)?;
-                if m.mode > Mode::Alone as u8 {
-                    wrong("mode", m.mode)?;
+                module_or_none("time-keeper", m.time_keeper)?;
+                if Mode::from_number(m.mode).is_none() {
+                    return wrong("mode", m.mode);
                 }
                 Message::Heartbeat(m)
             }

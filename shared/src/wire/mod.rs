@@ -12,19 +12,25 @@
 //! assert_eq!(Message::parse(&frame), Ok(Message::State(state)));
 //! ```
 
+mod fault;
 mod frame;
 mod layout;
 mod message;
+mod service;
+mod stop;
 
+pub use fault::{Clearing, Effect, Fault, LimitedBy};
 pub use frame::{Frame, Function, STATION, WireError};
 pub use layout::{Field, LAYOUTS, Layout, Senders, dbc};
 pub use message::{
-    ANGLE_LSB, EmergencyStop, FRAGMENTS, Fault, Fragment, GOAL_LSB, GOAL_POINTS, Goal, Health, Heartbeat, LATENT_SIZE,
-    LatentMessage, LimitedBy, Message, Mode, NOBODY, State, StopCommand, Sync, Telemetry, quantise_angle,
+    ANGLE_LSB, EmergencyStop, FRAGMENTS, Fragment, GOAL_LSB, GOAL_POINTS, Goal, Health, Heartbeat, LATENT_SIZE,
+    LatentMessage, Message, Mode, NOBODY, State, StopCommand, Sync, Telemetry, quantise_angle,
 };
+pub use service::{ALL_MODULES, Operation, ServiceCode, ServiceRequest, ServiceResponse};
+pub use stop::{StopCount, StopLatch};
 
 /// Version of this format; travels in every HEARTBEAT. It changes when a byte of an existing frame changes its meaning.
-pub const PROTOCOL_VERSION: u8 = 1;
+pub const PROTOCOL_VERSION: u8 = 2;
 
 #[cfg(test)]
 mod tests;

@@ -28,9 +28,10 @@ fn latent() -> LatentMessage {
 fn examples() -> Vec<(Message, u8, &'static str)> {
     let lsb = ANGLE_LSB;
     std::vec![
-        (Message::EmergencyStop(EmergencyStop::new(StopCommand::Stop, 0)), 3, "003#0100"),
-        (Message::EmergencyStop(EmergencyStop::new(StopCommand::Release, 0)), STATION, "07F#0200"),
-        (Message::Sync(Sync::new(0x1234, 8)), 0, "080#34120800"),
+        (Message::EmergencyStop(EmergencyStop::new(StopCommand::Stop, 0, StopCount::new(1))), 3, "003#010001"),
+        (Message::EmergencyStop(EmergencyStop::new(StopCommand::Release, 0, StopCount::new(2))), STATION, "07F#020002"),
+        (Message::EmergencyStop(EmergencyStop::new(StopCommand::Stop, 0, StopCount::UNKNOWN)), 3, "003#010000"),
+        (Message::Sync(Sync::new(0x1234, 7, 8)), 0, "080#34120708"),
         (Message::Goal(Goal::new(0x34, 2, Some([0.5, 1.5, -0.25]))), STATION, "17F#340580008001C0FF"),
         (
             Message::State(State::new(0x34, Health(3), &[lsb, -lsb, -2048.0 * lsb, -16.0 * lsb])),
@@ -38,6 +39,28 @@ fn examples() -> Vec<(Message, u8, &'static str)> {
             "183#340301F0FF0008FF"
         ),
         (Message::LatentFragment(latent().fragments()[0]), 3, "283#04340334127F8001"),
+        (
+            Message::ServiceRequest(ServiceRequest {
+                destination: ALL_MODULES,
+                operation: Operation::Arm as u8,
+                sequence: 7,
+                index: 0,
+                value: 0,
+            }),
+            STATION,
+            "37F#FF02070000000000",
+        ),
+        (
+            Message::ServiceResponse(ServiceResponse {
+                operation: Operation::Arm as u8,
+                sequence: 7,
+                code: ServiceCode::NotArmable as u8,
+                index: 0,
+                value: 0,
+            }),
+            3,
+            "383#0207060000000000",
+        ),
         (
             Message::Telemetry(Telemetry {
                 torque: [127, -127],
@@ -62,7 +85,7 @@ fn examples() -> Vec<(Message, u8, &'static str)> {
                 policy: 0x1234,
             }),
             3,
-            "483#0222090001013412"
+            "483#0222090002013412"
         ),
     ]
 }
@@ -127,20 +150,27 @@ fn whatever_is_not_exactly_right_is_refused_with_its_reason() {
     let cases: &[(&str, WireError)] = &[
         ("183#00", WireError::WrongLength { function: Function::State, got: 1, expected: 8 }),
         ("203#0000000000000000", WireError::WrongLength { function: Function::Latent, got: 8, expected: 64 }),
-        ("300#", WireError::UnknownFunction(6)),
+        ("500#", WireError::UnknownFunction(10)),
         ("7FF#0000", WireError::UnknownFunction(15)),
         ("1C0#0000000000000000", WireError::UnknownModule(64)),
         ("1FE#0000000000000000", WireError::UnknownModule(126)),
         ("1FF#0000000000000000", WireError::WrongSender { function: Function::State, module: STATION }),
         ("103#0000000000000000", WireError::WrongSender { function: Function::Goal, module: 3 }),
-        ("003#0200", WireError::WrongSender { function: Function::EmergencyStop, module: 3 }),
-        ("003#0300", WireError::WrongValue { function: Function::EmergencyStop, field: "command", value: 3 }),
-        ("080#00000001", WireError::ReservedBits(Function::Sync)),
-        ("183#0010000000000000", WireError::ReservedBits(Function::State)),
+        ("003#0100", WireError::WrongLength { function: Function::EmergencyStop, got: 2, expected: 3 }),
+        ("003#020000", WireError::WrongSender { function: Function::EmergencyStop, module: 3 }),
+        ("003#030000", WireError::WrongValue { function: Function::EmergencyStop, field: "command", value: 3 }),
+        ("003#010010", WireError::WrongValue { function: Function::EmergencyStop, field: "counter", value: 16 }),
+        ("080#00000000", WireError::WrongValue { function: Function::Sync, field: "modules", value: 0 }),
+        ("080#00000041", WireError::WrongValue { function: Function::Sync, field: "modules", value: 65 }),
+        ("303#0000000000000000", WireError::WrongSender { function: Function::ServiceRequest, module: 3 }),
+        (
+            "37F#4001000000000000",
+            WireError::WrongValue { function: Function::ServiceRequest, field: "destination", value: 64 },
+        ),
+        ("3FF#0000000000000000", WireError::WrongSender { function: Function::ServiceResponse, module: STATION }),
         ("283#8000000000000000", WireError::ReservedBits(Function::LatentFragment)),
         ("403#0000000000004000", WireError::WrongValue { function: Function::Telemetry, field: "module", value: 64 }),
-        ("483#0400000000000000", WireError::WrongValue { function: Function::Heartbeat, field: "mode", value: 4 }),
-        ("483#0000800000000000", WireError::ReservedBits(Function::Heartbeat)),
+        ("483#0700000000000000", WireError::WrongValue { function: Function::Heartbeat, field: "mode", value: 7 }),
         (
             "483#0000004000000000",
             WireError::WrongValue { function: Function::Heartbeat, field: "time-keeper", value: 64 },
@@ -192,10 +222,23 @@ fn the_document_says_what_the_code_does() {
         assert_eq!(rows.next().filter(|r| !r.starts_with("| bit")), None, "{name} has more rows than fields");
     }
     for fault in Fault::ALL {
-        has(&format!("| {} | {fault:?} | ", fault as u8));
+        let arming = if fault.forbids_arming() { "refused" } else { "allowed" };
+        let (effect, cleared_by) = (fault.effect().text(), fault.cleared_by());
+        has(&format!("| {} | {fault:?} | {effect} | {arming} | {cleared_by} |", fault as u8));
     }
-    let limits = [LimitedBy::Nothing, LimitedBy::Torque, LimitedBy::Slew, LimitedBy::JointAngle, LimitedBy::Relaxed];
-    for limit in limits {
+    for mode in Mode::ALL {
+        has(&format!("| {} | {} | ", mode as u8, mode.name()));
+        assert_eq!(Mode::from_number(mode as u8), Some(mode));
+    }
+    for operation in Operation::ALL {
+        has(&format!("| {} | {} | ", operation as u8, operation.name()));
+        assert_eq!(Operation::from_number(operation as u8), Some(operation));
+    }
+    for code in ServiceCode::ALL {
+        has(&format!("| {} | {code:?} | {code} |", code as u8));
+        assert_eq!(ServiceCode::from_number(code as u8), Some(code));
+    }
+    for limit in LimitedBy::ALL {
         has(&format!("| {} | {limit:?} | ", limit as u8));
     }
     has(&format!("Version {PROTOCOL_VERSION}."));
@@ -228,7 +271,7 @@ fn the_table_finds_the_fields_where_the_structs_put_them() {
     assert_eq!([0, 1, 2].map(|k| field(&goal, Function::Goal, "position", k)), [128, 384, -64]);
     assert_eq!(field(&goal, Function::Goal, "known", 0), 1);
     let sync = by_function(Function::Sync).0.emit(0, true);
-    assert_eq!((field(&sync, Function::Sync, "cycle", 0), field(&sync, Function::Sync, "alive", 0)), (0x1234, 8));
+    assert_eq!((field(&sync, Function::Sync, "cycle", 0), field(&sync, Function::Sync, "alive", 0)), (0x1234, 7));
     let latent = Message::Latent(latent()).emit(0, true);
     assert_eq!(field(&latent, Function::Latent, "policy", 0), 0x1234);
     assert_eq!(
@@ -244,22 +287,49 @@ fn the_table_finds_the_fields_where_the_structs_put_them() {
 }
 
 #[test]
-fn the_dbc_file_lists_every_frame_once() {
-    let mut text = String::new();
-    dbc(&mut text, 8).unwrap();
-    let ids: Vec<u16> = text
-        .lines()
-        .filter_map(|l| l.strip_prefix("BO_ "))
-        .map(|l| l.split(' ').next().unwrap().parse().unwrap())
-        .collect();
-    // Seven functions of eight modules, and the station's GOAL and EMERGENCY_STOP.
-    assert_eq!(ids.len(), 7 * 8 + 2);
-    assert!(ids.windows(2).all(|w| w[0] < w[1]));
-    assert!(text.contains("BO_ 515 LATENT_M3: 64 M3\n"));
-    assert!(text.contains(" SG_ angle_1 : 28|12@1- (0.00153398"));
-    assert!(text.contains("BA_ \"VFrameFormat\" BO_ 515 14;\n"));
-    assert_eq!(text.matches("BA_ \"VFrameFormat\" BO_").count(), 8);
-    assert!(text.contains("VAL_ 1155 fault 0 \"none\" 32 \"EmergencyStop\""));
+fn a_health_carries_the_last_stop_or_release() {
+    let health = Health::FAULT.with(Health::EMERGENCY_STOP).with_stop_count(StopCount::new(11));
+    assert_eq!(health, Health(0xbc));
+    assert_eq!(health.stop_count().number(), 11);
+    assert!(health.has(Health::EMERGENCY_STOP) && !health.sensors_plausible());
+    let moved = health.with_stop_count(StopCount::new(2));
+    assert_eq!((moved.0 & 15, moved.stop_count().number()), (12, 2));
+}
+
+#[test]
+fn a_request_is_answered_by_those_it_is_for() {
+    let request = ServiceRequest { destination: 3, operation: 5, sequence: 9, index: 17, value: 0 };
+    assert!(request.is_for(3) && !request.is_for(4));
+    assert!(ServiceRequest { destination: ALL_MODULES, ..request }.is_for(63));
+    let answer = request.answer(ServiceCode::NoSuchRegister, 0xa1b2_c3d4);
+    assert_eq!(Message::ServiceResponse(answer).emit(3, false), frame("383#05090211D4C3B2A1", false));
+}
+
+/// On an FD bus every frame is marked as FD, so that tools send the short ones as FD frames, too.
+#[test]
+fn the_dbc_file_lists_every_frame_of_its_bus_once() {
+    for fd in [true, false] {
+        let mut text = String::new();
+        dbc(&mut text, 8, fd).unwrap();
+        let ids: Vec<u16> = text
+            .lines()
+            .filter_map(|l| l.strip_prefix("BO_ "))
+            .map(|l| l.split(' ').next().unwrap().parse().unwrap())
+            .collect();
+        // Seven functions of eight modules; the station's GOAL, EMERGENCY_STOP and SERVICE_REQUEST.
+        assert_eq!(ids.len(), 7 * 8 + 3);
+        assert!(ids.windows(2).all(|w| w[0] < w[1]));
+        assert_eq!(text.contains("BO_ 515 LATENT_M3: 64 M3\n"), fd);
+        assert_eq!(text.contains("BO_ 643 LATENT_FRAGMENT_M3: 8 M3\n"), !fd);
+        assert!(text.contains(" SG_ angle_1 : 28|12@1- (0.00153398"));
+        for id in &ids {
+            assert_eq!(text.contains(&format!("BA_ \"VFrameFormat\" BO_ {id} 14;\n")), fd);
+        }
+        assert!(text.contains("VAL_ 1155 fault 0 \"none\" 32 \"EmergencyStop\""));
+        assert!(text.contains("VAL_ 1155 mode 0 \"boot\" 1 \"active\""));
+        assert!(text.contains("VAL_ 895 operation 1 \"HELLO\""));
+        assert!(text.contains("VAL_ 899 code 0 \"Ok\""));
+    }
 }
 
 proptest! {
@@ -270,7 +340,7 @@ proptest! {
     fn any_frame_is_refused_or_understood_completely(
         id in prop_oneof![9 => 0u16..0x500, 1 => any::<u16>()],
         fd in any::<bool>(),
-        len in prop_oneof![4 => Just(8u8), 1 => Just(2u8), 1 => Just(4u8), 2 => Just(64u8), 1 => any::<u8>()],
+        len in prop_oneof![4 => Just(8u8), 1 => Just(3u8), 1 => Just(4u8), 2 => Just(64u8), 1 => any::<u8>()],
         mut data in prop::array::uniform32(any::<u8>()),
         zeros in any::<bool>(),
     ) {
@@ -292,14 +362,14 @@ proptest! {
 
     #[test]
     fn whatever_is_emitted_is_understood(
-        module in 0u8..64, cycle in any::<u16>(), fd in any::<bool>(), health in 0u8..16,
+        module in 0u8..64, cycle in any::<u16>(), fd in any::<bool>(), health in any::<u8>(),
         x in prop::array::uniform4(any::<f32>()), key in prop::array::uniform16(any::<i8>()),
         value in prop::array::uniform32(any::<i8>()), policy in any::<u16>(),
     ) {
         let low = cycle as u8;
         let latent = LatentMessage { cycle: low, health: Health(health), policy, key, value };
         let messages = [
-            Message::Sync(Sync::new(cycle, module)),
+            Message::Sync(Sync::new(cycle, module, module + 1)),
             Message::State(State::new(low, Health(health), &x)),
             Message::Latent(latent),
             Message::LatentFragment(latent.fragments()[usize::from(low & 7)]),

@@ -4,7 +4,7 @@ use super::*;
 use crate::candump;
 use crate::faults::FaultPlan;
 use composer_shared::policy::{IMAGE_SIZE, random_image};
-use composer_shared::wire::{EmergencyStop, Fault as Trouble, Message};
+use composer_shared::wire::{EmergencyStop, Fault as Trouble, Message, StopCount};
 
 const MS: u64 = 1_000_000;
 
@@ -305,7 +305,7 @@ fn malformed_and_foreign_frames_are_survived_and_counted() {
         let fd = (random >> 33) & 3 != 0 || len > 8;
         // Any identifier but a stop, and SYNC of a module nearer the head than all.
         let id = 0x100 + (random >> 20) as u16 % 0x700;
-        let id = if id >> 7 < 6 { id | 0x40 } else { id };
+        let id = if id >> 7 < 8 { id | 0x40 } else { id };
         config.injected.push(Injected { at_ns: k * MS + k * 37, frame: Frame::new(id, fd, &bytes[..len]).unwrap() });
     }
     let mut toy = Toy::new(8, 60);
@@ -412,7 +412,7 @@ fn the_capture_is_a_candump_log_of_everything() {
 
 #[test]
 fn a_stop_from_anybody_counts() {
-    let stop = Message::EmergencyStop(EmergencyStop::new(StopCommand::Stop, 0)).emit(5, true);
+    let stop = Message::EmergencyStop(EmergencyStop::new(StopCommand::Stop, 0, StopCount::UNKNOWN)).emit(5, true);
     let config = SilConfig { injected: vec![Injected { at_ns: 500 * MS, frame: stop }], ..SilConfig::new(BusKind::Fd) };
     let mut toy = Toy::new(4, 20);
     simulate(&mut toy, &config);
