@@ -1,5 +1,6 @@
 //! The host of COMPOSER: physics, tasks, training, evaluation, export and the command line.
 
+pub mod bus_trial;
 pub mod cli;
 pub mod env;
 pub mod environment;
@@ -11,7 +12,9 @@ pub mod freeze;
 pub mod methods;
 pub mod mjcf;
 pub mod network;
+pub mod outcome;
 pub mod plot;
+pub mod policy;
 pub mod recorder;
 pub mod replay;
 pub mod robot;

@@ -7,8 +7,10 @@ use composer_sim_bridge::sil::{CycleView, ModuleView, SilReport};
 
 use crate::env::{EnvConfig, FaultsNow, SnakeEnv};
 use crate::environment::{Environment, View};
-use crate::eval::{self, Pilot};
+use crate::eval::{Trial, episode_seed};
 use crate::methods::mix;
+use crate::outcome;
+use crate::policy::Policy;
 use crate::replay::{Episode, FrameRecord, Look, Outline, Pose, Recording, Robot, Setting, Shape, Status};
 use crate::sil::SnakePlant;
 use crate::sim::Snake;
@@ -165,13 +167,13 @@ impl Recorder {
     }
 
     /// The episode on the bus with its result.
-    pub fn finish(mut self, result: &eval::Episode, report: &SilReport) -> Episode {
+    pub fn finish(mut self, result: &outcome::Episode, report: &SilReport) -> Episode {
         self.conclude(result);
         self.episode.note("bus load", format!("{:.1} %", 100.0 * report.bus_load));
         self.episode
     }
 
-    fn conclude(&mut self, result: &eval::Episode) {
+    fn conclude(&mut self, result: &outcome::Episode) {
         let words = self.task.rules().words();
         self.episode.note("result", if result.success { words.done } else { words.missed });
         self.episode.note("control steps", result.steps.to_string());
@@ -179,11 +181,22 @@ impl Recorder {
     }
 }
 
-/// Runs and records one episode without a bus; the same as [`eval::run_episode`].
+/// Runs the first `count` episodes of a trial again and records them.
+pub fn record(trial: &Trial, policy: &dyn Policy, count: usize) -> Vec<Episode> {
+    let mut env = SnakeEnv::new(trial.config.clone());
+    let record = |index: usize| {
+        let seed = episode_seed(trial.seed, index as u64);
+        let faults = (trial.faults)(seed, trial.config.robot.modules);
+        simulate(trial.config, &mut env, policy, &format!("episode {}", index + 1), seed, &faults)
+    };
+    (0..count.min(trial.episodes)).map(record).collect()
+}
+
+/// Runs and records one episode without a bus; the same as [`crate::eval::run_episode`].
 pub fn simulate(
     config: &EnvConfig,
     env: &mut SnakeEnv,
-    pilot: Pilot,
+    policy: &dyn Policy,
     name: &str,
     seed: u64,
     faults: &[ScheduledFault],
@@ -194,7 +207,7 @@ pub fn simulate(
     for step in 0u64.. {
         let mut weights = Vec::new();
         env.view(&mut view);
-        pilot.act(&view, mix(seed ^ step), &mut actions, Some(&mut weights));
+        policy.act(&view, mix(seed ^ step), &mut actions, Some(&mut weights));
         let hit = env.faults();
         let outcome = env.step(&actions);
         let time = outcome.steps as f32 * config.control_period;
@@ -212,7 +225,7 @@ pub fn simulate(
             break;
         }
     }
-    recorder.conclude(&eval::Episode::new(env.judge(), env.snake()));
+    recorder.conclude(&outcome::Episode::new(env.judge(), env.snake()));
     recorder.episode
 }
 
@@ -251,7 +264,8 @@ mod tests {
     use std::sync::Arc;
 
     use super::*;
-    use crate::eval::{Trial, episode_seed, healthy, run_episode};
+    use crate::eval::{healthy, run_episode};
+    use crate::policy::Random;
     use crate::robot::Robot;
 
     fn config(task: Task, cap: u32) -> Arc<EnvConfig> {
@@ -265,11 +279,11 @@ mod tests {
         for task in Task::ALL {
             let config = config(task, 12);
             let trial = Trial { config: &config, episodes: 2, seed: 3, faults: &healthy, threads: 1 };
-            let episodes = trial.record(Pilot::Random, 5);
+            let episodes = record(&trial, &Random, 5);
             assert_eq!(episodes.len(), 2);
             for (index, episode) in episodes.iter().enumerate() {
                 let mut env = SnakeEnv::new(config.clone());
-                run_episode(&mut env, Pilot::Random, episode_seed(3, index as u64), &[], |_, _| {});
+                run_episode(&mut env, &Random, episode_seed(3, index as u64), &[], |_, _| {});
                 let last = episode.frames().last().unwrap();
                 assert_eq!(episode.len(), 13);
                 assert!(last.links.iter().map(|pose| (pose.position, pose.rotation)).eq(env.snake().poses()), "{task}");
@@ -297,7 +311,7 @@ mod tests {
         let config = config(Task::GoalReaching, 12);
         let scheduled = |at_ns, fault| ScheduledFault { at_ns, until_ns: None, fault };
         let faults = [scheduled(200_000_000, Fault::Unplug(2)), scheduled(0, Fault::ActuatorDead(5))];
-        let episode = simulate(&config, &mut SnakeEnv::new(config.clone()), Pilot::Random, "hit", 1, &faults);
+        let episode = simulate(&config, &mut SnakeEnv::new(config.clone()), &Random, "hit", 1, &faults);
         let status = |frame: usize, module: usize| episode.frames()[frame].status[module];
         assert_eq!((status(1, 5), status(4, 2), status(5, 2)), (Status::ActuatorDead, Status::Ok, Status::Unplugged));
         assert_eq!(episode.frames()[12].torques[2], [0.0; 2]);

@@ -9,8 +9,8 @@ use composer_sim_bridge::Plant;
 use composer_sim_bridge::external_plant::PlantError;
 
 use crate::env::EnvConfig;
-use crate::eval::Episode;
 use crate::external::{Elsewhere, External};
+use crate::outcome::Episode;
 use crate::sim::Snake;
 use crate::tasks::{Judge, Point};
 

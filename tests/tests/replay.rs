@@ -7,7 +7,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use composer_host::env::EnvConfig;
-use composer_host::eval::{Pilot, Trial, healthy};
+use composer_host::eval::{Trial, healthy};
+use composer_host::policy::Random;
 use composer_host::recorder;
 use composer_host::replay::{
     Episode, FrameRecord, Look, Outline, Pose, Recording, Robot, Setting, Shape, Status, attention_bytes,
@@ -253,7 +254,7 @@ fn every_task() -> Recording {
     for task in Task::ALL {
         let config = config(task);
         let trial = Trial { config: &config, episodes: 1, seed: 1, faults: &healthy, threads: 1 };
-        trial.record(Pilot::Random, 1).into_iter().for_each(|episode| recording.push(episode));
+        recorder::record(&trial, &Random, 1).into_iter().for_each(|episode| recording.push(episode));
     }
     recording
 }

@@ -13,9 +13,10 @@ use composer_sim_bridge::sil::{self, SilConfig};
 use super::PolicySource;
 use crate::env::{EnvConfig, SnakeEnv};
 use crate::environment::{Environment, Told, Trivial, View};
-use crate::eval::{DEFAULT_SEED, Pilot, episode_seed, parallel};
+use crate::eval::{DEFAULT_SEED, episode_seed, parallel};
 use crate::methods::{Differentiation, Method, mix};
 use crate::mjcf::mjcf;
+use crate::policy::{Policy, Random};
 use crate::robot::{Robot, Solver};
 use crate::run::RunConfig;
 use crate::sil::SnakePlant;
@@ -56,7 +57,7 @@ fn physics(task: Task, robot: &Robot, threads: usize, seconds: f64) -> f64 {
         let (start, mut steps, mut seed) = (Instant::now(), 0u64, thread as u64);
         while start.elapsed().as_secs_f64() < seconds {
             env.view(&mut view);
-            Pilot::Random.act(&view, seed ^ steps, &mut actions, None);
+            Random.act(&view, seed ^ steps, &mut actions, None);
             let outcome = env.step(&actions);
             steps += 1;
             if outcome.terminated || outcome.truncated {

@@ -9,10 +9,9 @@ use composer_shared::policies;
 use composer_shared::policy::Task;
 use composer_sim_bridge::faults::FaultPlan;
 
-use super::eval::Common;
-use super::physics::Physics;
-use super::sil::{BusOptions, BusReport, BusTrial, REPLAYED, write_replay};
+use super::common::{REPLAYED, episode_bar, write_replay};
 use super::{PolicySource, task_by_name};
+use crate::bus_trial::{BusReport, BusSettings, BusTrial};
 use crate::env::EnvConfig;
 use crate::eval::DEFAULT_SEED;
 use crate::replay::Episode;
@@ -70,31 +69,21 @@ impl Shipped {
     /// Runs the episodes of a row; the first `record` of them are recorded.
     fn run(&self, arguments: &Arguments, fault: &str, record: usize) -> Result<(BusReport, Vec<Episode>)> {
         let fault: FaultPlan = fault.parse().with_context(|| format!("the fault {fault}"))?;
-        let common = Common {
-            policy: self.name.into(),
-            task: None,
-            episodes: arguments.episodes,
-            modules: None,
-            robot: None,
-            fault,
-            seed: arguments.seed,
-            published: false,
-            physics: Physics::default(),
-            json: false,
-            threads: None,
-        };
-        let bus = BusOptions::default();
         let trial = BusTrial {
             config: self.config.clone(),
             image: self.image,
-            common: &common,
-            bus: &bus,
+            episodes: arguments.episodes as usize,
+            seed: arguments.seed,
+            fault: &fault,
+            bus: BusSettings::default(),
+            physics: String::new(),
+            threads: super::cores(),
             record,
             qemu: None,
             parity: false,
             elsewhere: None,
         };
-        let bar = common.bar();
+        let bar = episode_bar(self.name, arguments.episodes);
         let result = trial.run(None, &|| bar.inc(1));
         bar.finish_and_clear();
         result

@@ -10,9 +10,10 @@ use serde::{Deserialize, Serialize};
 
 use super::policy_file::load_run;
 use crate::env::EnvConfig;
-use crate::eval::{PUBLISHED_EPISODES, PUBLISHED_SEED, Pilot, Report, Trial, healthy};
+use crate::eval::{PUBLISHED_EPISODES, PUBLISHED_SEED, Trial, healthy};
 use crate::files::write_whole;
 use crate::freeze::{Parity, freeze, parity};
+use crate::outcome::Report;
 use crate::run::RunConfig;
 use crate::stats::with_interval;
 
@@ -126,7 +127,7 @@ pub(super) fn measure(
     let draw = |seed, modules| plan.draw(seed, modules);
     let config = Arc::new(EnvConfig { robot: config.robot.with_modules(modules)?, ..config.clone() });
     let trial = Trial { config: &config, episodes: episodes as usize, seed: PUBLISHED_SEED, faults: &draw, threads };
-    Ok(trial.evaluate(Pilot::Integer(policy), fault, &|| {}).into())
+    Ok(trial.evaluate(&policy, fault, &|| {}).into())
 }
 
 /// Freezes the network of a run folder, with scales of `episodes` episodes; the difference of float and integer actions is that of as many others.

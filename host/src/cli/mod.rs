@@ -1,6 +1,7 @@
 //! The command line. Every verb is a thin layer over the library.
 
 mod bench;
+mod common;
 mod dbc;
 mod demo;
 mod eval;

@@ -6,8 +6,8 @@ use anyhow::{Context, Result, bail};
 use composer_shared::policy::{Policy, Task};
 
 use crate::env::EnvConfig;
-use crate::eval::Pilot;
 use crate::network::Network;
+use crate::policy;
 use crate::robot::Robot;
 use crate::run::RunConfig;
 use crate::tasks::{AllRules, TaskConfig, TaskSettings};
@@ -151,15 +151,13 @@ impl PolicySource {
         }
     }
 
-    /// The pilot that flies it. The image has been checked when it was loaded.
-    pub fn pilot(&self) -> Result<Pilot<'_>> {
+    /// What decides the torques. The image has been checked when it was loaded.
+    pub fn policy(&self) -> Result<Box<dyn policy::Policy + '_>> {
         Ok(match self {
-            PolicySource::Image(frozen) => {
-                Pilot::Integer(Policy::parse(&frozen.image).map_err(|e| anyhow::anyhow!("{e}"))?)
-            }
-            PolicySource::Run(run) => Pilot::Float(&run.0),
-            PolicySource::Still => Pilot::Still,
-            PolicySource::Random => Pilot::Random,
+            PolicySource::Image(frozen) => Box::new(Policy::parse(&frozen.image).map_err(|e| anyhow::anyhow!("{e}"))?),
+            PolicySource::Run(run) => Box::new(&run.0),
+            PolicySource::Still => Box::new(policy::Still),
+            PolicySource::Random => Box::new(policy::Random),
         })
     }
 

@@ -3,28 +3,20 @@
 use std::io::Write;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
 use composer_firmware::controller::{BusKind, Timing};
 use composer_shared::policy::Policy;
-use composer_shared::robot::AXES;
-use composer_sim_bridge::computer::{InProcess, Launcher};
 use composer_sim_bridge::external_plant::{self, Address};
-use composer_sim_bridge::faults::{FaultKind, PlannedFault};
-use composer_sim_bridge::frame_bits::BitRates;
 use composer_sim_bridge::qemu::{self, Qemu};
-use composer_sim_bridge::sil::{self, SilConfig, SilReport};
-use serde::Serialize;
 
 use super::PolicySource;
-use super::eval::{Common, table};
+use super::common::{Common, REPLAYED, table, write_replay};
+use crate::bus_trial::{BusReport, BusSettings, BusTrial};
 use crate::env::EnvConfig;
-use crate::eval::{Episode, Report, episode_seed, parallel};
 use crate::external::Elsewhere;
 use crate::files::write_whole;
-use crate::recorder::Recorder;
-use crate::sil::SnakePlant;
 
 /// Kind of bus, on the command line.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
@@ -54,6 +46,14 @@ pub struct BusOptions {
     /// Receivers see frames up to this many milliseconds late
     #[arg(long, value_name = "MS")]
     pub delay: Option<f64>,
+}
+
+impl BusOptions {
+    /// The bus that is asked for.
+    pub fn settings(&self) -> BusSettings {
+        let kind = if self.bus == Bus::Fd { BusKind::Fd } else { BusKind::Classic };
+        BusSettings { kind, bitrate: self.bitrate, data_bitrate: self.data_bitrate, drop: self.drop, delay: self.delay }
+    }
 }
 
 /// What the controllers run on.
@@ -139,247 +139,6 @@ pub struct Arguments {
     replay: Option<PathBuf>,
 }
 
-/// Episodes in a replay.
-pub const REPLAYED: usize = 4;
-
-/// Results on the bus: those of `eval`, and the bus's own.
-#[derive(Clone, Debug, Serialize)]
-pub struct BusReport {
-    /// As `eval` reports.
-    #[serde(flatten)]
-    pub task: Report,
-    /// "classic" or "fd".
-    pub bus: &'static str,
-    /// Share of the time in which the bus was busy, mean over the episodes.
-    pub bus_load: f64,
-    /// Largest age of a latent when it was acted on, ms.
-    pub latent_age_max_ms: f64,
-    /// Times that a live neighbour's latent was missing when a module acted.
-    pub deadline_misses: u64,
-    /// Error frames on the bus.
-    pub error_frames: u64,
-    /// Virtual time by wall time of one thread, physics included.
-    pub realtime_factor: f64,
-    /// Emulated modules that somebody else ended.
-    pub lost: usize,
-    /// What the comparison with controllers in this process came to.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub parity: Option<Parity>,
-}
-
-/// A comparison of emulated modules with controllers in this process.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
-pub struct Parity {
-    /// Control cycles compared, over all episodes.
-    pub cycles: u64,
-    /// Torques compared: yaw and pitch of every module at every physics step.
-    pub torques: u64,
-    /// Those of them whose bits differ.
-    pub different: u64,
-    /// Episodes in which anything else differs: their length, the bus, the modules' counters.
-    pub other: u64,
-}
-
-impl Parity {
-    fn of(ours: &Outcome, theirs: &Outcome) -> Self {
-        let (a, b) = (ours.plant.trace(), theirs.plant.trace());
-        let same = a.iter().flatten().zip(b.iter().flatten()).filter(|(a, b)| a == b).count();
-        let torques = AXES * a.len().max(b.len());
-        Parity {
-            cycles: u64::from(ours.plant.judge().steps()),
-            torques: torques as u64,
-            different: (torques - same) as u64,
-            other: u64::from(ours.report != theirs.report || ours.plant.episode() != theirs.plant.episode()),
-        }
-    }
-
-    fn add(self, other: Self) -> Self {
-        Parity {
-            cycles: self.cycles + other.cycles,
-            torques: self.torques + other.torques,
-            different: self.different + other.different,
-            other: self.other + other.other,
-        }
-    }
-
-    /// Whether there is no difference.
-    pub fn holds(&self) -> bool {
-        self.different == 0 && self.other == 0
-    }
-}
-
-/// Everything that defines a set of episodes on the bus.
-pub struct BusTrial<'a> {
-    /// The environment.
-    pub config: Arc<EnvConfig>,
-    /// The policy image.
-    pub image: &'a [u8],
-    /// Episodes, seed, faults.
-    pub common: &'a Common,
-    /// The bus.
-    pub bus: &'a BusOptions,
-    /// How many of the first episodes to record.
-    pub record: usize,
-    /// The emulated modules, if the controllers do not run in this process.
-    pub qemu: Option<&'a Qemu>,
-    /// Compare them with controllers in this process.
-    pub parity: bool,
-    /// The plant, if it is not this program's own physics.
-    pub elsewhere: Option<Elsewhere>,
-}
-
-/// One episode on the bus, and how long it took.
-struct Run {
-    episode: Episode,
-    report: SilReport,
-    wall: f64,
-    recorded: Option<crate::replay::Episode>,
-    parity: Option<Parity>,
-}
-
-/// What became of the plant, and the report.
-struct Outcome {
-    plant: SnakePlant,
-    report: SilReport,
-}
-
-impl BusTrial<'_> {
-    fn sil_config(&self, seed: u64) -> SilConfig {
-        let kind = if self.bus.bus == Bus::Fd { BusKind::Fd } else { BusKind::Classic };
-        let mut sil = SilConfig::new(kind);
-        if let Some(nominal) = self.bus.bitrate {
-            sil.rates = BitRates { nominal, data: sil.rates.data.max(nominal) };
-        }
-        if let Some(data) = self.bus.data_bitrate {
-            sil.rates.data = data;
-        }
-        let mut plan = self.common.fault.clone();
-        let planned = |kind| PlannedFault { kind, at_ns: None, until_ns: None };
-        plan.faults.extend(self.bus.drop.map(|p| planned(FaultKind::Drop(p))));
-        plan.faults.extend(self.bus.delay.map(|ms| planned(FaultKind::Delay((ms * 1e6) as u64))));
-        sil.faults = plan.draw(seed, self.config.robot.modules);
-        sil.seed = seed;
-        sil
-    }
-
-    fn episode(&self, index: usize, capture: Option<&mut dyn Write>) -> Result<Run> {
-        let seed = episode_seed(self.common.seed(), index as u64);
-        let sil = self.sil_config(seed);
-        let policy = Policy::parse(self.image).map_err(|e| anyhow::anyhow!("{e}"))?;
-        let local = InProcess::new(policy);
-        let name = format!("episode {}", index + 1);
-        let mut recorder = None;
-        let start = Instant::now();
-        let ours = match self.qemu {
-            Some(qemu) => {
-                self.simulate(qemu, policy, &sil, capture, (index < self.record).then_some(&name), &mut recorder)
-            }
-            None => self.simulate(&local, policy, &sil, capture, (index < self.record).then_some(&name), &mut recorder),
-        }
-        .map_err(|error| match self.qemu.is_some() || self.elsewhere.is_some() {
-            true => error.context(name.clone()),
-            false => error,
-        })?;
-        let wall = start.elapsed().as_secs_f64();
-        for lost in &ours.report.lost {
-            eprintln!(
-                "note: {name}: module {} was lost at {:.3} s: {}",
-                lost.module,
-                lost.at_ns as f64 * 1e-9,
-                lost.how
-            );
-        }
-        let parity = match self.parity {
-            false => None,
-            true => Some(Parity::of(&ours, &self.simulate(&local, policy, &sil, None, None, &mut None)?)),
-        };
-        let Outcome { plant, report } = ours;
-        let episode = plant.episode();
-        let recorded = recorder.map(|r| r.finish(&episode, &report));
-        Ok(Run { episode, report, wall, recorded, parity })
-    }
-
-    /// Runs one episode with the controllers of `launcher`; `recorder` becomes one if it gets a name.
-    fn simulate<L: Launcher>(
-        &self,
-        launcher: &L,
-        policy: Policy<'_>,
-        sil: &SilConfig,
-        capture: Option<&mut dyn Write>,
-        recorded: Option<&String>,
-        recorder: &mut Option<Recorder>,
-    ) -> Result<Outcome> {
-        let mut plant = match &self.elsewhere {
-            Some(elsewhere) => SnakePlant::elsewhere(self.config.clone(), sil.seed, elsewhere)?,
-            None => SnakePlant::new(self.config.clone(), sil.seed),
-        };
-        if self.parity {
-            plant.keep_trace();
-        }
-        *recorder = recorded.map(|name| Recorder::new(name, &plant, &sil.faults));
-        let report = sil::run_on(launcher, &mut plant, policy, sil, capture, &mut |cycle, plant| {
-            if let Some(recorder) = recorder {
-                recorder.cycle(cycle, plant);
-            }
-        })?;
-        if let Some(trouble) = plant.trouble() {
-            bail!("at {:.3} s {trouble}", report.duration_ns as f64 * 1e-9);
-        }
-        Ok(Outcome { plant, report })
-    }
-
-    /// Runs all episodes. `progress` is called after each.
-    pub fn run(
-        &self,
-        capture: Option<&mut dyn Write>,
-        progress: &(dyn Fn() + Sync),
-    ) -> Result<(BusReport, Vec<crate::replay::Episode>)> {
-        let episodes = self.common.episodes() as usize;
-        self.common.fault.check(self.config.robot.modules)?;
-        if self.bus.drop.is_some_and(|p| !(0.0..=1.0).contains(&p)) {
-            bail!("--drop is a probability: 0 to 1");
-        }
-        if self.bus.delay.is_some_and(|ms| !(0.0..=1000.0).contains(&ms)) {
-            bail!("--delay is 0 to 1000 ms");
-        }
-        let mut runs = Vec::with_capacity(episodes);
-        let alone = usize::from(capture.is_some());
-        if capture.is_some() {
-            runs.push(self.episode(0, capture)?);
-            progress();
-        }
-        // A server serves one after the other; the second would wait for its greeting.
-        let served = matches!(&self.elsewhere, Some(Elsewhere { address: Address::Tcp(_), .. }));
-        let threads = if served { 1 } else { self.common.threads.unwrap_or_else(super::cores) };
-        let rest = parallel(episodes - alone, threads, |index| {
-            let run = self.episode(index + alone, None);
-            progress();
-            run
-        });
-        for run in rest {
-            runs.push(run?);
-        }
-        let n = runs.len() as f64;
-        let episodes: Vec<Episode> = runs.iter().map(|r| r.episode).collect();
-        let virtual_time: f64 = runs.iter().map(|r| r.report.duration_ns as f64 * 1e-9).sum();
-        let report = BusReport {
-            task: Report {
-                physics: self.common.physics.to_string(),
-                ..Report::new(&episodes, &self.config, &self.common.fault.to_string())
-            },
-            bus: if self.bus.bus == Bus::Fd { "fd" } else { "classic" },
-            bus_load: runs.iter().map(|r| r.report.bus_load).sum::<f64>() / n,
-            latent_age_max_ms: runs.iter().map(|r| r.report.latent_age_max_ms).fold(0.0, f64::max),
-            deadline_misses: runs.iter().map(|r| r.report.deadline_misses).sum(),
-            error_frames: runs.iter().map(|r| r.report.error_frames).sum(),
-            realtime_factor: virtual_time / runs.iter().map(|r| r.wall).sum::<f64>().max(1e-9),
-            lost: runs.iter().map(|r| r.report.lost.len()).sum(),
-            parity: runs.iter().filter_map(|r| r.parity).reduce(Parity::add),
-        };
-        Ok((report, runs.into_iter().filter_map(|r| r.recorded).collect()))
-    }
-}
-
 /// Runs the verb.
 pub fn run(arguments: &Arguments) -> Result<()> {
     let common = &arguments.common;
@@ -397,8 +156,12 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let trial = BusTrial {
         config: config.clone(),
         image,
-        common,
-        bus: &arguments.bus,
+        episodes: common.episodes() as usize,
+        seed: common.seed(),
+        fault: &common.fault,
+        bus: arguments.bus.settings(),
+        physics: common.physics.to_string(),
+        threads: common.threads.unwrap_or_else(super::cores),
         record,
         qemu: qemu.as_ref(),
         parity: arguments.emulation.parity,
@@ -464,19 +227,4 @@ pub fn bus_table(report: &BusReport) -> String {
         );
     }
     text
-}
-
-/// Writes recorded episodes as one page.
-pub fn write_replay(
-    config: &EnvConfig,
-    title: &str,
-    episodes: Vec<crate::replay::Episode>,
-    policy: &str,
-    path: &std::path::Path,
-) -> Result<()> {
-    let mut recording = crate::recorder::recording(config, title, policy);
-    for episode in episodes {
-        recording.push(episode);
-    }
-    recording.write_html(path).with_context(|| format!("no replay in {}", path.display()))
 }

@@ -10,10 +10,11 @@ use crc::{CRC_32_ISO_HDLC, Crc};
 use super::policy_file::{CONFIG_FILE, NETWORK_FILE, load_config};
 use super::task_by_name;
 use crate::env::SnakeEnv;
-use crate::eval::{Pilot, Report, Trial, curve_seed, healthy};
+use crate::eval::{Trial, curve_seed, healthy};
 use crate::files::{create_folder, write_whole};
 use crate::methods::Method;
 use crate::network::Network;
+use crate::outcome::Report;
 use crate::robot::Robot;
 use crate::run::RunConfig;
 use crate::train::{TrainSummary, train};
@@ -122,10 +123,10 @@ pub fn train_in(config: &RunConfig, out: &Path, resuming: bool, name: Option<&st
             faults: &healthy,
             threads: config.train.threads(),
         };
-        let report = trial.evaluate(Pilot::Float(network), "none", &|| {});
+        let report = trial.evaluate(network, "none", &|| {});
         let mut scalars = scalars(&report, "evaluation");
         if config.faults.probability > 0.0 {
-            let report = Trial { faults: &faulty, ..trial }.evaluate(Pilot::Float(network), "as trained", &|| {});
+            let report = Trial { faults: &faulty, ..trial }.evaluate(network, "as trained", &|| {});
             scalars.extend(self::scalars(&report, "evaluation_faults"));
         }
         // A run that is killed keeps the policy of its last evaluation; a failure to write shows at the checkpoint.

@@ -7,10 +7,11 @@ use anyhow::{Result, bail};
 
 use crate::env::SnakeEnv;
 use crate::environment::{Environment, View};
-use crate::eval::{DEFAULT_SEED, Pilot, episode_seed};
+use crate::eval::{DEFAULT_SEED, episode_seed};
 use crate::files::write_whole;
 use crate::network::Network;
 use crate::plot::{Heatmap, heatmaps};
+use crate::policy::Policy;
 use crate::run::RunConfig;
 
 /// Matrices in the figure, evenly over the episode.
@@ -47,7 +48,7 @@ fn successful(env: &Arc<crate::env::EnvConfig>, network: &Network, seed: u64) ->
     loop {
         let mut attention = Vec::new();
         env.view(&mut view);
-        Pilot::Float(network).act(&view, 0, &mut actions, Some(&mut attention));
+        Policy::act(network, &view, 0, &mut actions, Some(&mut attention));
         if attention.is_empty() {
             bail!("the policy has no attention to draw");
         }

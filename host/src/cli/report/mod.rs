@@ -17,7 +17,7 @@ use serde_json::{Value, json};
 
 use super::policy_file::{CONFIG_FILE, load_config, load_run};
 use super::train::train_in;
-use crate::eval::{PUBLISHED_EPISODES, PUBLISHED_SEED, Pilot, Trial, healthy, parallel};
+use crate::eval::{PUBLISHED_EPISODES, PUBLISHED_SEED, Trial, healthy, parallel};
 use crate::files::{create_folder, write_whole};
 use crate::methods::Method;
 use crate::plot::{Axes, Panel, common_grid, mean_and_error, mean_and_se, panels};
@@ -278,7 +278,7 @@ fn finish(what: What, run: &Run, episodes: u64, threads: usize) -> Result<()> {
         let plan: composer_sim_bridge::faults::FaultPlan =
             fault.parse().with_context(|| format!("the fault {fault}"))?;
         let draw = |seed, modules| plan.draw(seed, modules);
-        let report = Trial { faults: &draw, ..trial }.evaluate(Pilot::Float(&network), fault, &|| {});
+        let report = Trial { faults: &draw, ..trial }.evaluate(&network, fault, &|| {});
         results.insert(fault.into(), serde_json::to_value(report)?);
     }
     write_whole(&result, serde_json::to_string_pretty(&results)?.as_bytes())

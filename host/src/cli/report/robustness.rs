@@ -121,7 +121,7 @@ fn measured(
             faults: &healthy,
             threads: arguments.threads.unwrap_or_else(crate::cli::cores),
         };
-        Ok(trial.evaluate(source.pilot()?, "none", &|| {}).into())
+        Ok(trial.evaluate(&*source.policy()?, "none", &|| {}).into())
     })
 }
 

@@ -1,0 +1,91 @@
+//! Whoever decides the torques of all modules of a robot: what evaluation, replay and benchmark run, whatever method made it.
+
+use composer_shared::policy::{Encoded, Latent, Policy as Image};
+use composer_shared::robot::MAX_MODULES;
+
+use crate::environment::View;
+use crate::methods::mix;
+use crate::network::Network;
+
+/// Decides what every module does in one control step.
+pub trait Policy: Sync {
+    /// The actions of all modules for one step, without exploration; yaw and pitch torque as a fraction of the limit, the environment
+    /// clips. `noise` differs from step to step, for those that act at random. `attention` gets the weights, row-major, if there are any.
+    fn act(&self, view: &View, noise: u64, actions: &mut Vec<[f32; 2]>, attention: Option<&mut Vec<f32>>);
+}
+
+impl<P: Policy + ?Sized> Policy for &P {
+    fn act(&self, view: &View, noise: u64, actions: &mut Vec<[f32; 2]>, attention: Option<&mut Vec<f32>>) {
+        (**self).act(view, noise, actions, attention);
+    }
+}
+
+/// Room for the actions of all modules: zeros.
+fn still(view: &View, actions: &mut Vec<[f32; 2]>) {
+    actions.clear();
+    actions.resize(view.observations.len(), [0.0; 2]);
+}
+
+/// The network of COMPOSER as it was trained, in 32-bit floats.
+impl Policy for Network {
+    fn act(&self, view: &View, _noise: u64, actions: &mut Vec<[f32; 2]>, attention: Option<&mut Vec<f32>>) {
+        still(view, actions);
+        let modules = actions.len();
+        let attention = attention.map(|weights| {
+            weights.clear();
+            weights.resize(modules * modules, 0.0);
+            weights.as_mut_slice()
+        });
+        Network::act(self, &view.observations, &view.heard, actions, attention);
+    }
+}
+
+/// The frozen integer policy, as the modules run it.
+impl Policy for Image<'_> {
+    fn act(&self, view: &View, _noise: u64, actions: &mut Vec<[f32; 2]>, attention: Option<&mut Vec<f32>>) {
+        still(view, actions);
+        let modules = actions.len();
+        let encoded: Vec<Encoded> = view.observations.iter().map(|o| self.encode(o)).collect();
+        let mut latents = [Latent::default(); MAX_MODULES];
+        for (slot, e) in latents.iter_mut().zip(&encoded) {
+            *slot = e.latent;
+        }
+        let mut rows = attention;
+        if let Some(rows) = rows.as_deref_mut() {
+            rows.clear();
+        }
+        for (module, own) in encoded.iter().enumerate() {
+            let mut weights = [0u16; MAX_MODULES];
+            actions[module] = Image::act(self, own, &latents, view.heard[module], Some(&mut weights), module);
+            if let Some(rows) = rows.as_deref_mut() {
+                rows.extend(weights[..modules].iter().map(|&w| f32::from(w) / 32767.0));
+            }
+        }
+    }
+}
+
+/// All torques stay zero. A baseline.
+#[derive(Clone, Copy, Debug)]
+pub struct Still;
+
+impl Policy for Still {
+    fn act(&self, view: &View, _noise: u64, actions: &mut Vec<[f32; 2]>, _attention: Option<&mut Vec<f32>>) {
+        still(view, actions);
+    }
+}
+
+/// A new random torque for each motor and step. A baseline.
+#[derive(Clone, Copy, Debug)]
+pub struct Random;
+
+impl Policy for Random {
+    fn act(&self, view: &View, noise: u64, actions: &mut Vec<[f32; 2]>, _attention: Option<&mut Vec<f32>>) {
+        still(view, actions);
+        for (index, action) in actions.iter_mut().enumerate() {
+            *action = [0, 1].map(|axis| {
+                let bits = mix(noise ^ mix((2 * index + axis) as u64));
+                (bits >> 40) as f32 / (1u64 << 23) as f32 - 1.0
+            });
+        }
+    }
+}
