@@ -2,30 +2,45 @@
 //! ([`crate::memory_map`]), is written by the host (`snakectl flash`) and read by the board at power-up, so that all modules run the
 //! same image and the same policy.
 //!
-//! # Layout, version 1
+//! # Layout, version 2
 //!
-//! 128 bytes, all numbers little-endian; `f32` is IEEE 754 binary32. "Not a number" and infinities lie outside of every range.
+//! 184 bytes, all numbers little-endian; `f32` is IEEE 754 binary32. "Not a number" and infinities lie outside of every range. Torque is in the robot's
+//! torque unit.
 //!
 //! | offset | type | field | accepted |
 //! |---|---|---|---|
 //! | 0 | u8\[8\] | magic | the ASCII characters `COMPNODE` |
-//! | 8 | u16 | layout version | 1 |
+//! | 8 | u16 | layout version | 2 |
 //! | 10 | u8 | number of this module, 0 is the head | 0 to modules - 1 |
 //! | 11 | u8 | modules of the robot | 1 to 64 |
 //! | 12 | u8 | after bus-off: 0 recover, 1 stay off until a restart | 0, 1 |
-//! | 13 | u8\[3\] | reserved | 0 |
-//! | 16 + 4 j | u16 | encoder of joint j: what it reads when the joint is straight | 0 to 16383 |
-//! | 18 + 4 j | u8 | encoder of joint j: 1 if it counts down while the joint angle grows | 0, 1 |
-//! | 19 + 4 j | u8 | reserved | 0 |
-//! | 32 | f32\[9\] | rotation from the axes of the inertial sensor to the module's own frame, row by row | a rotation |
-//! | 68 + 28 m | f32 | motor m (0 yaw, 1 pitch): torque units per ampere; negative if the wires are swapped | magnitude 0.001 to 1000000 |
-//! | 72 + 28 m | f32 | largest current, A | 0.001 to 100 |
-//! | 76 + 28 m | f32 | current that cuts the motor off, A | the largest current to 200 |
-//! | 80 + 28 m | f32 | winding resistance, ohm | 0.001 to 1000 |
-//! | 84 + 28 m | f32 | winding inductance, H | 0.000001 to 1 |
-//! | 88 + 28 m | f32 | current sense: A from one end of the converter's range to the other; negative if it is turned | magnitude 0.001 to 1000 |
-//! | 92 + 28 m | f32 | current sense: reading without current, part of the range | 0 to 1 |
-//! | 124 | u32 | CRC-32 (ISO-HDLC) of bytes 0 to 123 | |
+//! | 13 | u8 | while the sensors say what cannot be true: 0 relax, 1 act on zeros as the paper's observation fault does | 0, 1 |
+//! | 14 | u16 | dead-man time, ms: so long without a frame of the station, and the module relaxes and disarms; 0 never | 0, 200 to 60000 |
+//! | 16 + 12 j | u16 | encoder of joint j: what it reads when the joint is straight | 0 to 16383 |
+//! | 18 + 12 j | u8 | encoder of joint j: 1 if it counts down while the joint angle grows | 0, 1 |
+//! | 19 + 12 j | u8 | reserved | 0 |
+//! | 20 + 12 j | f32 | least angle of joint j, rad | -3.1 to -0.05 |
+//! | 24 + 12 j | f32 | greatest angle of joint j, rad | 0.05 to 3.1 |
+//! | 64 | f32\[9\] | rotation from the axes of the inertial sensor to the module's own frame, row by row | a rotation |
+//! | 100 | f32 | cap of the torque; the policy's limit counts where it is smaller | 0.001 to 1000000 |
+//! | 104 | f32 | cap of the slew, torque per second; likewise | 0.001 to 100000000 |
+//! | 108 | f32 | cap of the motor temperature, degrees Celsius; likewise | 30 to 150 |
+//! | 112 | f32 | supply below which the motors relax, V | 6 to 60 |
+//! | 116 | f32 | supply above which the motors relax, V | 1.2 times the lower one to 60 |
+//! | 120 + 28 m | f32 | motor m (0 yaw, 1 pitch): torque units per ampere; negative if the wires are swapped | magnitude 0.001 to 1000000 |
+//! | 124 + 28 m | f32 | largest current, A | 0.001 to 100 |
+//! | 128 + 28 m | f32 | current that cuts the motor off, A | the largest current to 95 % of what the current sense can say in either direction |
+//! | 132 + 28 m | f32 | winding resistance, ohm | 0.001 to 1000 |
+//! | 136 + 28 m | f32 | winding inductance, H | 0.000001 to 1 |
+//! | 140 + 28 m | f32 | current sense: A from one end of the converter's range to the other; negative if it is turned | magnitude 0.001 to 1000 |
+//! | 144 + 28 m | f32 | current sense: reading without current, part of the range | 0 to 1 |
+//! | 176 | u32 | reserved | 0 |
+//! | 180 | u32 | CRC-32 (ISO-HDLC) of bytes 0 to 179 | |
+//!
+//! A joint may not be allowed all of half a turn: an encoder of a single turn could not tell its ends apart. Nor may the cut-off lie where the current sense
+//! has no more readings: it could never happen.
+//!
+//! Version 1 had no limits; a page of it is refused, because nobody said how far the joints of its module may go.
 
 use core::fmt;
 
@@ -34,11 +49,14 @@ use crc::{CRC_32_ISO_HDLC, Crc};
 
 use crate::drivers::encoder::{JointCalibration, STEPS};
 use crate::failsafe::BusOffPolicy;
+use crate::limits::{Caps, JointRange};
+use crate::safety::Safety;
+use crate::supply::Thresholds;
 
 /// Bytes of a node page; a multiple of 8, the least that the flash writes.
-pub const SIZE: usize = 128;
+pub const SIZE: usize = 184;
 /// Version of the layout that this code reads and writes.
-pub const VERSION: u16 = 1;
+pub const VERSION: u16 = 2;
 /// The first bytes of every node page.
 pub const MAGIC: [u8; 8] = *b"COMPNODE";
 
@@ -46,19 +64,31 @@ const VERSION_AT: usize = 8;
 const NODE_AT: usize = 10;
 const MODULES_AT: usize = 11;
 const BUS_OFF_AT: usize = 12;
-const RESERVED_AT: usize = 13;
-const ENCODERS_AT: usize = 16;
-const ENCODER_SIZE: usize = 4;
-const MOUNTING_AT: usize = ENCODERS_AT + ENCODER_SIZE * MAX_JOINTS;
-const MOTORS_AT: usize = MOUNTING_AT + 9 * 4;
+const BLIND_AT: usize = 13;
+const DEAD_MAN_AT: usize = 14;
+const JOINTS_AT: usize = 16;
+const JOINT_SIZE: usize = 12;
+const MOUNTING_AT: usize = JOINTS_AT + JOINT_SIZE * MAX_JOINTS;
+const CAPS_AT: usize = MOUNTING_AT + 9 * 4;
+const SUPPLY_AT: usize = CAPS_AT + 3 * 4;
+const MOTORS_AT: usize = SUPPLY_AT + 2 * 4;
 const MOTOR_SIZE: usize = 7 * 4;
-const CRC_AT: usize = MOTORS_AT + MOTOR_SIZE * AXES;
+const RESERVED_AT: usize = MOTORS_AT + MOTOR_SIZE * AXES;
+const CRC_AT: usize = RESERVED_AT + 4;
 const _: () = assert!(CRC_AT + 4 == SIZE);
 
 pub(crate) const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
 
 /// How far the rows of a rotation may be from orthonormal.
 const ORTHONORMAL: f32 = 1e-3;
+/// How far a joint may be allowed to go, rad.
+pub const FARTHEST: f32 = 3.1;
+/// How far it must be allowed to go at least, rad.
+const NEAREST: f32 = 0.05;
+/// The part of what a current sense can say in which a cut-off must lie: noise must not hide it at the end.
+const SENSIBLE: f32 = 0.95;
+/// Below this supply the bridges of the board switch themselves off, V.
+pub const LOWEST_SUPPLY: f32 = 6.0;
 
 /// A motor and its current sense, as measured.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -84,6 +114,11 @@ impl MotorCalibration {
     pub fn current(&self, reading: f32) -> f32 {
         (reading - self.sense_zero) * self.sense_range
     }
+
+    /// The largest current that the sense can say in both directions, A.
+    pub fn measurable(&self) -> f32 {
+        self.sense_range.abs() * self.sense_zero.min(1.0 - self.sense_zero)
+    }
 }
 
 /// What was measured on the hardware of one module.
@@ -97,6 +132,24 @@ pub struct Calibration {
     pub motors: [MotorCalibration; AXES],
 }
 
+impl Calibration {
+    /// What the board's parts say on paper, for hardware that nobody measured: encoders that were never zeroed, an inertial sensor that sits straight, gear
+    /// motors of 80 torque units (0.2 N m) per ampere. `host/configs/calibration.toml` says the same in SI units; a test compares them.
+    pub const NOMINAL: Calibration = Calibration {
+        joints: [JointCalibration { zero: 0, reversed: false }; MAX_JOINTS],
+        imu_mounting: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+        motors: [MotorCalibration {
+            torque_constant: 80.0,
+            current_limit: 1.2,
+            cut_off: 2.5,
+            resistance: 4.0,
+            inductance: 1e-3,
+            sense_range: 6.6,
+            sense_zero: 0.5,
+        }; AXES],
+    };
+}
+
 /// A node page, checked.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct NodePage {
@@ -106,6 +159,8 @@ pub struct NodePage {
     pub modules: u8,
     /// What to do after bus-off.
     pub bus_off: BusOffPolicy,
+    /// What it keeps to, whatever its policy wants.
+    pub safety: Safety,
     /// What was measured.
     pub calibration: Calibration,
 }
@@ -151,12 +206,14 @@ impl fmt::Display for NodePageError {
                 write!(f, "the node page is cut short: it has {length} bytes where {SIZE} are needed")
             }
             Self::Magic => write!(f, "this is not a node page: it does not begin with COMPNODE"),
-            Self::Version { found } => {
-                write!(
-                    f,
-                    "the node page has layout version {found}, this build reads version {VERSION}: write it again"
-                )
-            }
+            Self::Version { found: 1 } => write!(
+                f,
+                "the node page has layout version 1, which says nothing of limits, and this build reads version {VERSION}: write it again with `snakectl flash`"
+            ),
+            Self::Version { found } => write!(
+                f,
+                "the node page has layout version {found}, this build reads version {VERSION}: write it again with `snakectl flash`"
+            ),
             Self::Checksum { stored, computed } => {
                 write!(f, "the node page is damaged: its CRC-32 should be {stored:08x} and is {computed:08x}")
             }
@@ -173,6 +230,15 @@ impl NodePage {
     /// Reads a node page from the flash region it lies in; bytes after it are ignored.
     pub fn parse(region: &[u8]) -> Result<Self, NodePageError> {
         let short = NodePageError::TooShort { length: region.len() };
+        // An older page may be shorter, and should be called old.
+        if let Some([magic @ .., low, high]) = region.first_chunk::<{ VERSION_AT + 2 }>()
+            && *magic == MAGIC
+        {
+            let found = u16::from_le_bytes([*low, *high]);
+            if found != VERSION {
+                return Err(NodePageError::Version { found });
+            }
+        }
         let bytes = region.first_chunk::<SIZE>().ok_or(short)?;
         let field = |at: usize| bytes.get(at).copied();
         let word = |at: usize| bytes.get(at..).and_then(|rest| rest.first_chunk::<4>()).map(|b| u32::from_le_bytes(*b));
@@ -187,10 +253,6 @@ impl NodePage {
         if *magic != MAGIC {
             return Err(NodePageError::Magic);
         }
-        let found = u16::from_le_bytes([byte(VERSION_AT)?, byte(VERSION_AT + 1)?]);
-        if found != VERSION {
-            return Err(NodePageError::Version { found });
-        }
         let stored = word(CRC_AT).ok_or(short)?;
         let computed = CRC.checksum(bytes.get(..CRC_AT).ok_or(short)?);
         if stored != computed {
@@ -202,17 +264,26 @@ impl NodePage {
             1 => BusOffPolicy::Latch,
             _ => return Err(NodePageError::Value { field: "choice after bus-off", accepted: "0 or 1" }),
         };
-        let mut reserved = bytes.get(RESERVED_AT..ENCODERS_AT).ok_or(short)?.iter().fold(0, |all, b| all | b);
-        let mut joints = [JointCalibration { zero: 0, reversed: false }; MAX_JOINTS];
-        for (j, joint) in joints.iter_mut().enumerate() {
-            let at = ENCODERS_AT + ENCODER_SIZE * j;
-            joint.zero = u16::from_le_bytes([byte(at)?, byte(at + 1)?]);
+        let blind_relaxes = match byte(BLIND_AT)? {
+            0 => true,
+            1 => false,
+            _ => return Err(NodePageError::Value { field: "choice while blind", accepted: "0 or 1" }),
+        };
+        let half = |at: usize| Ok(u16::from_le_bytes([byte(at)?, byte(at + 1)?]));
+        let dead_man_ms = half(DEAD_MAN_AT)?;
+        let mut reserved = word(RESERVED_AT).ok_or(short)?;
+        let mut joints = Calibration::NOMINAL.joints;
+        let mut ranges = Safety::BOARD.joints;
+        for (j, (joint, range)) in joints.iter_mut().zip(&mut ranges).enumerate() {
+            let at = JOINTS_AT + JOINT_SIZE * j;
+            joint.zero = half(at)?;
             joint.reversed = match byte(at + 2)? {
                 0 => false,
                 1 => true,
                 _ => return Err(NodePageError::Value { field: "direction of an encoder", accepted: "0 or 1" }),
             };
-            reserved |= byte(at + 3)?;
+            reserved |= u32::from(byte(at + 3)?);
+            *range = JointRange { min: float(at + 4)?, max: float(at + 8)? };
         }
         if reserved != 0 {
             return Err(NodePageError::Value { field: "reserved byte", accepted: "0" });
@@ -221,6 +292,8 @@ impl NodePage {
         for (i, value) in imu_mounting.iter_mut().flatten().enumerate() {
             *value = float(MOUNTING_AT + 4 * i)?;
         }
+        let caps = Caps { torque: float(CAPS_AT)?, torque_slew: float(CAPS_AT + 4)?, temperature: float(CAPS_AT + 8)? };
+        let supply = Thresholds { under: float(SUPPLY_AT)?, over: float(SUPPLY_AT + 4)? };
         let motor = |m: usize| {
             let float = |i: usize| float(MOTORS_AT + MOTOR_SIZE * m + 4 * i);
             Ok(MotorCalibration {
@@ -234,7 +307,8 @@ impl NodePage {
             })
         };
         let calibration = Calibration { joints, imu_mounting, motors: [motor(0)?, motor(1)?] };
-        let page = NodePage { node: byte(NODE_AT)?, modules: byte(MODULES_AT)?, bus_off, calibration };
+        let safety = Safety { joints: ranges, caps, supply, dead_man_ms, blind_relaxes };
+        let page = NodePage { node: byte(NODE_AT)?, modules: byte(MODULES_AT)?, bus_off, safety, calibration };
         page.check()?;
         Ok(page)
     }
@@ -249,9 +323,19 @@ impl NodePage {
         put(NODE_AT, &[self.node]);
         put(MODULES_AT, &[self.modules]);
         put(BUS_OFF_AT, &[u8::from(self.bus_off == BusOffPolicy::Latch)]);
-        for (j, joint) in self.calibration.joints.iter().enumerate() {
-            put(ENCODERS_AT + ENCODER_SIZE * j, &joint.zero.to_le_bytes());
-            put(ENCODERS_AT + ENCODER_SIZE * j + 2, &[u8::from(joint.reversed)]);
+        let Safety { joints: ranges, caps, supply, dead_man_ms, blind_relaxes } = self.safety;
+        put(BLIND_AT, &[u8::from(!blind_relaxes)]);
+        put(DEAD_MAN_AT, &dead_man_ms.to_le_bytes());
+        for (j, (joint, range)) in self.calibration.joints.iter().zip(ranges).enumerate() {
+            let at = JOINTS_AT + JOINT_SIZE * j;
+            put(at, &joint.zero.to_le_bytes());
+            put(at + 2, &[u8::from(joint.reversed)]);
+            put(at + 4, &range.min.to_le_bytes());
+            put(at + 8, &range.max.to_le_bytes());
+        }
+        let limits = [caps.torque, caps.torque_slew, caps.temperature, supply.under, supply.over];
+        for (i, value) in limits.iter().enumerate() {
+            put(CAPS_AT + 4 * i, &value.to_le_bytes());
         }
         for (i, value) in self.calibration.imu_mounting.iter().flatten().enumerate() {
             put(MOUNTING_AT + 4 * i, &value.to_le_bytes());
@@ -269,30 +353,56 @@ impl NodePage {
         Ok(bytes)
     }
 
-    fn check(&self) -> Result<(), NodePageError> {
+    /// Whether it can be.
+    pub fn check(&self) -> Result<(), NodePageError> {
         let within = |value: f32, low: f32, high: f32| value >= low && value <= high;
         let Calibration { joints, imu_mounting, motors } = &self.calibration;
+        let Safety { joints: ranges, caps, supply, dead_man_ms, .. } = &self.safety;
         let all = |good: &dyn Fn(&MotorCalibration) -> bool| motors.iter().all(good);
         let checks = [
             ((1..=MAX_MODULES).contains(&usize::from(self.modules)), "number of modules", "1 to 64"),
             (self.node < self.modules, "number of this module", "0 to the number of modules - 1"),
             (joints.iter().all(|joint| joint.zero < STEPS), "zero of an encoder", "0 to 16383"),
             (
+                ranges.iter().all(|range| within(range.min, -FARTHEST, -NEAREST)),
+                "least angle of a joint",
+                "-3.1 to -0.05 rad",
+            ),
+            (
+                ranges.iter().all(|range| within(range.max, NEAREST, FARTHEST)),
+                "greatest angle of a joint",
+                "0.05 to 3.1 rad",
+            ),
+            (
+                *dead_man_ms == 0 || (200..=60_000).contains(dead_man_ms),
+                "dead-man time",
+                "0 (never), or 200 to 60000 ms",
+            ),
+            (
                 is_rotation(imu_mounting),
                 "mounting of the inertial sensor",
                 "a rotation: orthonormal rows, right-handed",
             ),
+            (within(caps.torque, 1e-3, 1e6), "cap of the torque", "0.001 to 1000000 torque units"),
+            (within(caps.torque_slew, 1e-3, 1e8), "cap of the slew", "0.001 to 100000000 torque units per second"),
+            (within(caps.temperature, 30.0, 150.0), "cap of the motor temperature", "30 to 150 degrees Celsius"),
+            (within(supply.under, LOWEST_SUPPLY, 60.0), "lowest supply", "6 to 60 V"),
+            (within(supply.over, 1.2 * supply.under, 60.0), "highest supply", "1.2 times the lowest to 60 V"),
             (
                 all(&|m| within(m.torque_constant.abs(), 1e-3, 1e6)),
                 "torque constant",
                 "0.001 to 1000000 torque units per ampere",
             ),
             (all(&|m| within(m.current_limit, 1e-3, 100.0)), "current limit", "0.001 to 100 A"),
-            (all(&|m| within(m.cut_off, m.current_limit, 200.0)), "cut-off current", "the current limit to 200 A"),
             (all(&|m| within(m.resistance, 1e-3, 1e3)), "winding resistance", "0.001 to 1000 ohm"),
             (all(&|m| within(m.inductance, 1e-6, 1.0)), "winding inductance", "0.000001 to 1 H"),
             (all(&|m| within(m.sense_range.abs(), 1e-3, 1e3)), "range of the current sense", "0.001 to 1000 A"),
             (all(&|m| within(m.sense_zero, 0.0, 1.0)), "zero of the current sense", "0 to 1"),
+            (
+                all(&|m| within(m.cut_off, m.current_limit, SENSIBLE * m.measurable())),
+                "cut-off current",
+                "the current limit to 95 % of what the current sense can say in either direction; beyond that it could never cut off",
+            ),
         ];
         match checks.into_iter().find(|(good, ..)| !good) {
             Some((_, field, accepted)) => Err(NodePageError::Value { field, accepted }),
@@ -336,6 +446,13 @@ pub(crate) mod tests {
             node: 3,
             modules: 8,
             bus_off: BusOffPolicy::Latch,
+            safety: Safety {
+                joints: [-2.0, -2.1, -2.2, -2.3].map(|min| JointRange { min, max: 1.5 }),
+                caps: Caps { torque: 60.0, torque_slew: 300.0, temperature: 75.0 },
+                supply: Thresholds { under: 9.5, over: 15.0 },
+                dead_man_ms: 0x1234,
+                blind_relaxes: false,
+            },
             calibration: Calibration {
                 joints,
                 imu_mounting: [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
@@ -353,15 +470,23 @@ pub(crate) mod tests {
     #[test]
     fn the_bytes_are_those_of_the_table() {
         let bytes = page().encode().unwrap();
-        assert_eq!(bytes[..16], *b"COMPNODE\x01\0\x03\x08\x01\0\0\0");
-        assert_eq!(bytes[24..28], [0x34, 0x12, 1, 0]);
-        assert_eq!(bytes[36..40], 1.0f32.to_le_bytes());
-        assert_eq!(bytes[68..72], 80.0f32.to_le_bytes());
-        assert_eq!(bytes[96..100], (-79.0f32).to_le_bytes());
-        assert_eq!(bytes[120..124], 0.5f32.to_le_bytes());
+        assert_eq!(bytes[..16], *b"COMPNODE\x02\0\x03\x08\x01\x01\x34\x12");
+        assert_eq!(bytes[40..44], [0x34, 0x12, 1, 0]);
+        assert_eq!(bytes[44..48], (-2.2f32).to_le_bytes());
+        assert_eq!(bytes[60..64], 1.5f32.to_le_bytes());
+        assert_eq!(bytes[68..72], 1.0f32.to_le_bytes());
+        assert_eq!(bytes[100..104], 60.0f32.to_le_bytes());
+        assert_eq!(bytes[104..108], 300.0f32.to_le_bytes());
+        assert_eq!(bytes[108..112], 75.0f32.to_le_bytes());
+        assert_eq!(bytes[112..116], 9.5f32.to_le_bytes());
+        assert_eq!(bytes[116..120], 15.0f32.to_le_bytes());
+        assert_eq!(bytes[120..124], 80.0f32.to_le_bytes());
+        assert_eq!(bytes[148..152], (-79.0f32).to_le_bytes());
+        assert_eq!(bytes[172..176], 0.5f32.to_le_bytes());
+        assert_eq!(bytes[176..180], [0; 4]);
         // The same checksum as the policy image's: of "123456789" it is 0xcbf43926.
         assert_eq!(CRC.checksum(b"123456789"), 0xcbf4_3926);
-        assert_eq!(bytes[124..], CRC.checksum(&bytes[..124]).to_le_bytes());
+        assert_eq!(bytes[180..], CRC.checksum(&bytes[..180]).to_le_bytes());
     }
 
     #[test]
@@ -378,28 +503,42 @@ pub(crate) mod tests {
         assert_eq!(NodePage::parse(&good[..SIZE - 1]), Err(NodePageError::TooShort { length: SIZE - 1 }));
         assert_eq!(NodePage::parse(&[0; SIZE]), Err(NodePageError::Magic));
         let mut bytes = good;
-        bytes[8] = 2;
-        assert_eq!(NodePage::parse(&bytes), Err(NodePageError::Version { found: 2 }));
+        bytes[8] = 3;
+        assert_eq!(NodePage::parse(&bytes), Err(NodePageError::Version { found: 3 }));
         let mut bytes = good;
         bytes[70] ^= 4;
         assert!(matches!(NodePage::parse(&bytes), Err(NodePageError::Checksum { .. })));
 
         let nan = f32::NAN.to_le_bytes();
-        let cases: [(usize, &[u8], &str); 14] = [
+        let cases: [(usize, &[u8], &str); 28] = [
             (10, &[8], "number of this module"),
             (11, &[0], "number of modules"),
             (11, &[65], "number of modules"),
             (12, &[2], "choice after bus-off"),
-            (15, &[1], "reserved byte"),
-            (27, &[1], "reserved byte"),
+            (13, &[2], "choice while blind"),
+            (14, &[199, 0], "dead-man time"),
+            (14, &[0xff, 0xff], "dead-man time"),
+            (43, &[1], "reserved byte"),
+            (177, &[1], "reserved byte"),
             (17, &[0x40], "zero of an encoder"),
             (18, &[2], "direction of an encoder"),
-            (36, &nan, "mounting of the inertial sensor"),
-            (68, &0.0f32.to_le_bytes(), "torque constant"),
-            (100, &nan, "current limit"),
-            (104, &1.0f32.to_le_bytes(), "cut-off current"),
-            (112, &f32::INFINITY.to_le_bytes(), "winding inductance"),
-            (120, &(-0.1f32).to_le_bytes(), "zero of the current sense"),
+            (20, &(-3.15f32).to_le_bytes(), "least angle of a joint"),
+            (32, &0.0f32.to_le_bytes(), "least angle of a joint"),
+            (24, &3.15f32.to_le_bytes(), "greatest angle of a joint"),
+            (60, &nan, "greatest angle of a joint"),
+            (68, &nan, "mounting of the inertial sensor"),
+            (100, &0.0f32.to_le_bytes(), "cap of the torque"),
+            (104, &f32::INFINITY.to_le_bytes(), "cap of the slew"),
+            (108, &200.0f32.to_le_bytes(), "cap of the motor temperature"),
+            (112, &5.9f32.to_le_bytes(), "lowest supply"),
+            (116, &9.6f32.to_le_bytes(), "highest supply"),
+            (116, &nan, "highest supply"),
+            (120, &0.0f32.to_le_bytes(), "torque constant"),
+            (152, &nan, "current limit"),
+            (156, &1.0f32.to_le_bytes(), "cut-off current"),
+            (164, &f32::INFINITY.to_le_bytes(), "winding inductance"),
+            (172, &(-0.1f32).to_le_bytes(), "zero of the current sense"),
+            (172, &0.99f32.to_le_bytes(), "cut-off current"),
         ];
         for (at, what, wanted) in cases {
             let mut bytes = good;
@@ -409,6 +548,48 @@ pub(crate) mod tests {
                 other => panic!("byte {at}: {other:?}"),
             }
         }
+    }
+
+    #[test]
+    fn a_cut_off_beyond_the_converters_range_is_refused() {
+        // 6.6 A from end to end: at most 3.3 A in either direction, of which 95 % can be told from the end.
+        for (cut_off, good) in [(2.5, true), (3.1, true), (3.2, false), (10.0, false), (f32::NAN, false)] {
+            let mut page = page();
+            page.calibration.motors[1].cut_off = cut_off;
+            assert_eq!(page.encode().is_ok(), good, "{cut_off} A");
+            let mut bytes = self::page().encode().unwrap();
+            bytes[156..160].copy_from_slice(&f32::to_le_bytes(cut_off));
+            assert_eq!(NodePage::parse(&mended(bytes)).is_ok(), good, "{cut_off} A, read");
+        }
+        // A sense whose zero is not in the middle says less in one direction.
+        let mut page = page();
+        page.calibration.motors[0].sense_zero = 0.3;
+        let error = page.encode().unwrap_err().to_string();
+        assert_eq!(
+            error,
+            "the node page has a cut-off current that cannot be: accepted is the current limit to 95 % of what the current sense can say in either direction; beyond that it could never cut off"
+        );
+    }
+
+    #[test]
+    fn a_page_of_version_1_is_refused_in_words() {
+        let mut bytes = [0; SIZE];
+        bytes[..16].copy_from_slice(b"COMPNODE\x01\0\x03\x08\0\0\0\0");
+        let error = NodePage::parse(&bytes).unwrap_err();
+        assert_eq!(error, NodePageError::Version { found: 1 });
+        assert_eq!(
+            error.to_string(),
+            "the node page has layout version 1, which says nothing of limits, and this build reads version 2: write it again with `snakectl flash`"
+        );
+        // It was 128 bytes long.
+        assert_eq!(NodePage::parse(&bytes[..128]), Err(NodePageError::Version { found: 1 }));
+    }
+
+    #[test]
+    fn the_defaults_of_the_board_are_a_page() {
+        let page = NodePage { safety: Safety::BOARD, calibration: Calibration::NOMINAL, ..page() };
+        assert_eq!(NodePage::parse(&page.encode().unwrap()), Ok(page));
+        assert!(page.safety.dead_man_ms > 0 && page.safety.blind_relaxes, "the safe choices are the default");
     }
 
     #[test]

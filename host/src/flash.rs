@@ -5,8 +5,11 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail, ensure};
 use composer_firmware::drivers::encoder::JointCalibration;
+use composer_firmware::limits::{Caps, JointRange};
 use composer_firmware::memory_map::{FLASH_ADDRESS, FLASH_SIZE, NODE_PAGE_ADDRESS, POLICY_ADDRESS};
 use composer_firmware::node_page::{Calibration, MotorCalibration};
+use composer_firmware::safety::Safety;
+use composer_firmware::supply::Thresholds;
 use composer_shared::robot::MAX_JOINTS;
 use object::read::elf::{FileHeader, ProgramHeader};
 use object::{LittleEndian, elf};
@@ -29,6 +32,8 @@ pub const CHIP: &str = "STM32G474RETx";
 struct CalibrationFile {
     encoders: [Encoder; MAX_JOINTS],
     imu: Imu,
+    limits: Limits,
+    supply: Supply,
     yaw: Motor,
     pitch: Motor,
 }
@@ -38,6 +43,25 @@ struct CalibrationFile {
 struct Encoder {
     zero: u16,
     reversed: bool,
+    min: f32,
+    max: f32,
+}
+
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Limits {
+    torque: f32,
+    torque_slew: f32,
+    temperature: f32,
+    dead_man_ms: u16,
+    blind_relaxes: bool,
+}
+
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Supply {
+    lowest: f32,
+    highest: f32,
 }
 
 #[derive(Clone, Debug, Deserialize)]
@@ -58,13 +82,14 @@ struct Motor {
     sense_zero: f32,
 }
 
-/// Reads the text of a calibration file; `robot` says how many newton metres its unit of torque is. Ranges are checked when the node page
-/// is made of it.
-pub fn calibration(text: &str, robot: &Robot) -> Result<Calibration> {
+/// Reads the text of a calibration file: what was measured, and what the module is to keep to. `robot` says how many newton metres its unit of torque is.
+/// Ranges are checked when the node page is made of it.
+pub fn calibration(text: &str, robot: &Robot) -> Result<(Calibration, Safety)> {
     let file: CalibrationFile =
         toml::from_str(text).map_err(|e| anyhow::anyhow!("{}", e.to_string().trim().replace('\n', " ")))?;
+    let units = |newton_metres: f32| newton_metres / robot.scale.newton_metres_per_unit;
     let motor = |motor: &Motor| MotorCalibration {
-        torque_constant: motor.torque_constant / robot.scale.newton_metres_per_unit,
+        torque_constant: units(motor.torque_constant),
         current_limit: motor.current_limit,
         cut_off: motor.cut_off,
         resistance: motor.resistance,
@@ -72,8 +97,20 @@ pub fn calibration(text: &str, robot: &Robot) -> Result<Calibration> {
         sense_range: motor.sense_range,
         sense_zero: motor.sense_zero,
     };
+    let safety = Safety {
+        joints: file.encoders.each_ref().map(|encoder| JointRange { min: encoder.min, max: encoder.max }),
+        caps: Caps {
+            torque: units(file.limits.torque),
+            torque_slew: units(file.limits.torque_slew),
+            temperature: file.limits.temperature,
+        },
+        supply: Thresholds { under: file.supply.lowest, over: file.supply.highest },
+        dead_man_ms: file.limits.dead_man_ms,
+        blind_relaxes: file.limits.blind_relaxes,
+    };
     let joints = file.encoders.map(|encoder| JointCalibration { zero: encoder.zero, reversed: encoder.reversed });
-    Ok(Calibration { joints, imu_mounting: file.imu.mounting, motors: [motor(&file.yaw), motor(&file.pitch)] })
+    let motors = [motor(&file.yaw), motor(&file.pitch)];
+    Ok((Calibration { joints, imu_mounting: file.imu.mounting, motors }, safety))
 }
 
 /// Checks that a file is an image for the board: an ARM program all of whose bytes lie in the flash region for code.
@@ -160,13 +197,16 @@ mod tests {
     #[test]
     fn the_nominal_calibration_fits_the_robot_that_ships() {
         let robot = Robot::default();
-        let calibration = calibration(NOMINAL_CALIBRATION, &robot).unwrap();
-        let page = NodePage { node: 0, modules: 8, bus_off: BusOffPolicy::Recover, calibration };
+        let (calibration, safety) = calibration(NOMINAL_CALIBRATION, &robot).unwrap();
+        let page = NodePage { node: 0, modules: 8, bus_off: BusOffPolicy::Recover, safety, calibration };
         assert_eq!(NodePage::parse(&page.encode().unwrap()), Ok(page));
+        // One definition: the file says in SI units what the firmware says in those of the robot.
+        assert_eq!((calibration, safety), (Calibration::NOMINAL, Safety::BOARD));
+        assert_eq!((safety.caps.torque, safety.caps.torque_slew), (robot.torque_limit, robot.torque_slew));
         for motor in calibration.motors {
             let reachable = motor.current_limit * motor.torque_constant;
             assert!(reachable >= robot.torque_limit, "{reachable}");
-            assert!(motor.sense_range / 2.0 > motor.cut_off, "the cut-off current can be measured");
+            assert!(motor.measurable() > motor.cut_off, "the cut-off current can be measured");
         }
     }
 
@@ -175,7 +215,10 @@ mod tests {
         for (from, to, word) in [
             ("cut_off", "cutoff", "cutoff"),
             ("zero = 0 ", "zero = 70000 ", "70000"),
-            ("[[encoders]]\nzero = 0\nreversed = false\n\n[imu]", "[imu]", "length 3"),
+            ("[limits]", "[bounds]", "bounds"),
+            ("dead_man_ms = 2000", "dead_man_ms = 70000", "70000"),
+            ("highest = 16.0", "", "highest"),
+            ("[[encoders]]\nzero = 0\nreversed = false\nmin = -3.0\nmax = 3.0\n\n[imu]", "[imu]", "length 3"),
         ] {
             let text = NOMINAL_CALIBRATION.replacen(from, to, 1);
             assert_ne!(text, NOMINAL_CALIBRATION);

@@ -9,8 +9,11 @@ use std::process::Output;
 
 use common::{command, refuse};
 use composer_firmware::failsafe::BusOffPolicy;
+use composer_firmware::limits::{Caps, JointRange};
 use composer_firmware::memory_map::{FLASH_ADDRESS, NODE_PAGE_ADDRESS, POLICY_ADDRESS};
 use composer_firmware::node_page::NodePage;
+use composer_firmware::safety::Safety;
+use composer_firmware::supply::Thresholds;
 use composer_shared::policies;
 
 /// Keeps its arguments, one call a line, and a copy of each file it is to write. `list` prints the file `probes`; the call whose arguments
@@ -128,6 +131,9 @@ fn what_was_measured_arrives() {
     let text = composer_host::flash::NOMINAL_CALIBRATION;
     let text = text.replacen("zero = 0 ", "zero = 4711 ", 1).replacen("reversed = false", "reversed = true", 1);
     let text = text.replacen("torque_constant = 0.2", "torque_constant = -0.1", 1);
+    let text = text.replacen("min = -3.0 ", "min = -1.25 ", 1).replacen("max = 3.0", "max = 2.5", 1);
+    let text = text.replacen("torque_slew = 0.5 ", "torque_slew = 0.25 ", 1).replacen("= 2000", "= 500", 1);
+    let text = text.replacen("lowest = 9.0", "lowest = 10.5", 1);
     bench.write("three.toml", text.as_bytes());
     let output = bench.flash(&["--calibration", "three.toml", "--modules", "4"]);
     assert!(output.status.success() && output.stderr.is_empty(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -136,6 +142,20 @@ fn what_was_measured_arrives() {
     let joint = page.calibration.joints[0];
     assert_eq!((joint.zero, joint.reversed, page.modules), (4711, true, 4));
     assert_eq!(page.calibration.motors.map(|motor| motor.torque_constant), [-40.0, 80.0]);
+    let expected = Safety {
+        caps: Caps { torque_slew: 100.0, ..Safety::BOARD.caps },
+        supply: Thresholds { under: 10.5, ..Safety::BOARD.supply },
+        dead_man_ms: 500,
+        joints: [
+            JointRange { min: -1.25, max: 2.5 },
+            page.safety.joints[1],
+            page.safety.joints[2],
+            page.safety.joints[3],
+        ],
+        ..Safety::BOARD
+    };
+    assert_eq!(page.safety, expected);
+    assert_eq!(page.safety.joints[1..], Safety::BOARD.joints[1..]);
 }
 
 #[test]
@@ -200,6 +220,19 @@ fn what_cannot_be_a_module_is_refused_before_anything_is_written() {
     for (from, to, word) in [
         ("cut_off", "cutoff", "cutoff"),
         ("cut_off = 2.5", "cut_off = 0.5", "cut-off current"),
+        // 6.6 A from end to end of the converter: 10 A would never be seen.
+        ("cut_off = 2.5", "cut_off = 10.0", "it could never cut off"),
+        ("min = -3.0", "min = -3.2", "-3.1 to -0.05 rad"),
+        ("max = 3.0", "max = 0.0", "0.05 to 3.1 rad"),
+        ("torque = 0.2 ", "torque = 0.0 ", "cap of the torque"),
+        ("torque_slew = 0.5", "torque_slew = nan", "cap of the slew"),
+        ("temperature = 80.0", "temperature = 300.0", "30 to 150 degrees Celsius"),
+        ("dead_man_ms = 2000", "dead_man_ms = 50", "0 (never), or 200 to 60000 ms"),
+        ("dead_man_ms = 2000", "dead_man_ms = 2e6", "dead_man_ms"),
+        ("blind_relaxes = true", "blind_relaxes = 1", "blind_relaxes"),
+        ("lowest = 9.0", "lowest = 5.0", "6 to 60 V"),
+        ("highest = 16.0", "highest = 10.0", "1.2 times the lowest to 60 V"),
+        ("[limits]", "[limit]", "limit"),
         ("zero = 0 ", "zero = 16384 ", "0 to 16383"),
         ("[0.0, 0.0, 1.0]]", "[0.0, 0.0, -1.0]]", "rotation"),
         ("torque_constant = 0.2", "torque_constant = nan", "torque constant"),

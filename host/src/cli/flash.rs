@@ -26,7 +26,7 @@ pub struct Arguments {
     /// Policy image, or the name of one that ships
     #[arg(long, value_name = "FILE", default_value = "goal-reaching")]
     policy: String,
-    /// What was measured on this module; without it the nominal values of host/configs/calibration.toml
+    /// What was measured on this module, and its limits; without it the nominal values of host/configs/calibration.toml
     #[arg(long, value_name = "FILE")]
     calibration: Option<PathBuf>,
     /// What to do after bus-off: go on, or stay silent until a restart
@@ -84,7 +84,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     }
     if arguments.calibration.is_none() {
         eprintln!(
-            "snakectl: without --calibration the module gets nominal values, and encoders that were never zeroed"
+            "snakectl: without --calibration the module gets nominal values and limits, and encoders that were never zeroed"
         );
     }
     if arguments.dry_run {
@@ -119,12 +119,12 @@ fn node_page(arguments: &Arguments) -> Result<NodePage> {
         }
         None => (NOMINAL_CALIBRATION.to_string(), "host/configs/calibration.toml".to_string()),
     };
-    let calibration = calibration(&text, &robot).with_context(|| format!("{name} is no calibration"))?;
+    let (calibration, safety) = calibration(&text, &robot).with_context(|| format!("{name} is no calibration"))?;
     let bus_off = match arguments.bus_off {
         BusOff::Recover => BusOffPolicy::Recover,
         BusOff::Latch => BusOffPolicy::Latch,
     };
-    Ok(NodePage { node: arguments.node, modules: arguments.modules, bus_off, calibration })
+    Ok(NodePage { node: arguments.node, modules: arguments.modules, bus_off, safety, calibration })
 }
 
 /// What the module is now.
@@ -132,7 +132,8 @@ fn summary(page: &NodePage, policy: &[u8]) -> String {
     let (tag, torque) = Policy::parse(policy).map_or((0, 0.0), |p| (p.tag(), p.limits().torque));
     let part = |motor: usize| {
         let motor = &page.calibration.motors[motor];
-        (motor.current_limit * motor.torque_constant.abs() / torque * 100.0).min(100.0)
+        let reached = (motor.current_limit * motor.torque_constant.abs()).min(page.safety.caps.torque);
+        (reached / torque * 100.0).min(100.0)
     };
     format!(
         "module {} of {}, policy {tag:04x}; its motors reach {:.0} % (yaw) and {:.0} % (pitch) of the policy's torque",
