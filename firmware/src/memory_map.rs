@@ -3,8 +3,9 @@
 //!
 //! | region | from | bytes | content |
 //! |---|---|---|---|
-//! | code | 0x0800_0000 | 444 K | the image |
-//! | policy | 0x0806_f000 | 64 K | a policy image ([`composer_shared::policy`]) |
+//! | code | 0x0800_0000 | 432 K | the image |
+//! | policy | 0x0806_c000 | 64 K | a policy image ([`composer_shared::policy`]) |
+//! | storage | 0x0807_c000 | 16 K | what the module writes itself (`storage`): 8 K fault log, 4 K copy of the node page, and last: |
 //! | node page | 0x0807_f000 | 4 K | what makes this module this module (`node_page`) |
 //!
 //! Every region begins at a multiple of 4 KB, the largest page that this chip has (2 KB with two banks, 4 KB with one), so that each can be
@@ -13,15 +14,19 @@
 /// First byte of the flash.
 pub const FLASH_ADDRESS: u32 = 0x0800_0000;
 /// Bytes of flash for code and constants.
-pub const FLASH_SIZE: u32 = 444 * 1024;
+pub const FLASH_SIZE: u32 = 432 * 1024;
 /// Where the policy image lies.
 pub const POLICY_ADDRESS: u32 = FLASH_ADDRESS + FLASH_SIZE;
 /// Most bytes that a policy image may have.
 pub const POLICY_SIZE: u32 = 64 * 1024;
-/// Where the node page lies.
-pub const NODE_PAGE_ADDRESS: u32 = POLICY_ADDRESS + POLICY_SIZE;
-/// Bytes reserved for the node page.
-pub const NODE_PAGE_SIZE: u32 = 4 * 1024;
+/// Where the module keeps what it writes itself: four sections, the last of which is the node page.
+pub const STORAGE_ADDRESS: u32 = POLICY_ADDRESS + POLICY_SIZE;
+/// From one section of the storage to the next: what the chip may erase at once.
+pub const SECTION_SIZE: u32 = 4 * 1024;
+/// Bytes of the storage.
+pub const STORAGE_SIZE: u32 = 4 * SECTION_SIZE;
+/// Where the node page lies, the last section of the storage.
+pub const NODE_PAGE_ADDRESS: u32 = STORAGE_ADDRESS + 3 * SECTION_SIZE;
 
 // All 512 KB are given away, and nothing twice.
-const _: () = assert!(NODE_PAGE_ADDRESS + NODE_PAGE_SIZE == FLASH_ADDRESS + 512 * 1024);
+const _: () = assert!(STORAGE_ADDRESS + STORAGE_SIZE == FLASH_ADDRESS + 512 * 1024);

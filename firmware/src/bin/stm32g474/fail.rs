@@ -66,3 +66,18 @@ unsafe fn DefaultHandler(exception: i16) {
     defmt::error!("unexpected exception {=i16}", exception);
     wait_for_watchdog()
 }
+
+/// A double word of the storage that lost its power while it was written has a wrong checksum, which the chip tells by this exception. The reader
+/// finds out by a checksum of its own, so there is nothing else to do.
+#[exception]
+unsafe fn NonMaskableInt() {
+    let checked = pac::FLASH.eccr().read();
+    if checked.eccd() || checked.eccd2() {
+        // Flags are cleared by writing ones.
+        pac::FLASH.eccr().modify(|_| {});
+        return;
+    }
+    motors_off();
+    defmt::error!("unexpected non-maskable interrupt");
+    wait_for_watchdog()
+}

@@ -43,6 +43,7 @@ use core::cell::RefCell;
 
 use composer_firmware::controller::{BusKind, Config, ConfigError, Controller, FIRMWARE_VERSION};
 use composer_firmware::node_page::NodePage;
+use composer_firmware::storage::read_page;
 use composer_shared::observation::Sensors;
 use composer_shared::policy::Policy;
 use composer_shared::robot::AXES;
@@ -62,6 +63,7 @@ use embassy_time::{Duration, Instant, Timer, with_deadline};
 use static_cell::StaticCell;
 
 use can::CanPort;
+use flash::Storage;
 use sense::Sense;
 
 bind_interrupts!(struct Irqs {
@@ -115,7 +117,8 @@ async fn main(_spawner: Spawner) -> ! {
     fail::prepare();
     let mut light = Output::new(p.PB10, Level::Low, Speed::Low);
 
-    let page = match flash::node_page() {
+    let mut storage = Storage::new(p.FLASH);
+    let page = match read_page(&mut storage) {
         Ok(page) => page,
         Err(error) => {
             defmt::error!("{}", Display2Format(&error));
