@@ -158,6 +158,7 @@ impl Experiment {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::robot::Solver;
 
     #[test]
     fn the_default_step_is_converged() {
@@ -174,6 +175,22 @@ mod tests {
             assert!(error < 0.01 * way.max(1.0), "{}: {error} of {way}", experiment.name());
             assert!(coarse.joint_gap < 1e-3 * robot.link_length);
             assert!(coarse.penetration < 0.02 * 2.0 * robot.link_radius, "{}", coarse.penetration);
+        }
+    }
+
+    #[test]
+    fn rapiers_own_solver_agrees() {
+        let distance = |a: [f32; 3], b: [f32; 3]| (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f32>().sqrt();
+        for experiment in Experiment::ALL {
+            let run = |solver| experiment.run(&Robot { solver, ..Robot::default() });
+            let (direct, rapier) = (run(Solver::Direct), run(Solver::Rapier));
+            let way = distance(direct.links[0], [0.0; 3]);
+            let apart = direct.distance(&rapier);
+            // Different regularisations of friction, different contacts: a few percent.
+            assert!(apart < 0.05 * way.max(5.0), "{}: {apart} of {way}", experiment.name());
+            if let (Some(a), Some(b)) = (direct.block, rapier.block) {
+                assert!(distance(a, b) < 0.5, "{a:?} {b:?}");
+            }
         }
     }
 
