@@ -317,7 +317,10 @@ impl NodePage {
     pub fn encode(&self) -> Result<[u8; SIZE], NodePageError> {
         self.check()?;
         let mut bytes = [0; SIZE];
-        let mut put = |at: usize, what: &[u8]| bytes[at..at + what.len()].copy_from_slice(what);
+        // All offsets lie within the page. Not by indices: a module that stores its page must not panic.
+        let mut put = |at: usize, what: &[u8]| {
+            bytes.iter_mut().skip(at).zip(what).for_each(|(to, from)| *to = *from);
+        };
         put(0, &MAGIC);
         put(VERSION_AT, &VERSION.to_le_bytes());
         put(NODE_AT, &[self.node]);
@@ -348,8 +351,9 @@ impl NodePage {
                 put(MOTORS_AT + MOTOR_SIZE * m + 4 * i, &value.to_le_bytes());
             }
         }
-        let crc = CRC.checksum(&bytes[..CRC_AT]);
-        bytes[CRC_AT..].copy_from_slice(&crc.to_le_bytes());
+        if let Some((body, crc)) = bytes.split_last_chunk_mut::<4>() {
+            *crc = CRC.checksum(body).to_le_bytes();
+        }
         Ok(bytes)
     }
 
@@ -358,7 +362,6 @@ impl NodePage {
         let within = |value: f32, low: f32, high: f32| value >= low && value <= high;
         let Calibration { joints, imu_mounting, motors } = &self.calibration;
         let Safety { joints: ranges, caps, supply, dead_man_ms, .. } = &self.safety;
-        let all = |good: &dyn Fn(&MotorCalibration) -> bool| motors.iter().all(good);
         let checks = [
             ((1..=MAX_MODULES).contains(&usize::from(self.modules)), "number of modules", "1 to 64"),
             (self.node < self.modules, "number of this module", "0 to the number of modules - 1"),
@@ -389,17 +392,21 @@ impl NodePage {
             (within(supply.under, LOWEST_SUPPLY, 60.0), "lowest supply", "6 to 60 V"),
             (within(supply.over, 1.2 * supply.under, 60.0), "highest supply", "1.2 times the lowest to 60 V"),
             (
-                all(&|m| within(m.torque_constant.abs(), 1e-3, 1e6)),
+                every(motors, |m| within(m.torque_constant.abs(), 1e-3, 1e6)),
                 "torque constant",
                 "0.001 to 1000000 torque units per ampere",
             ),
-            (all(&|m| within(m.current_limit, 1e-3, 100.0)), "current limit", "0.001 to 100 A"),
-            (all(&|m| within(m.resistance, 1e-3, 1e3)), "winding resistance", "0.001 to 1000 ohm"),
-            (all(&|m| within(m.inductance, 1e-6, 1.0)), "winding inductance", "0.000001 to 1 H"),
-            (all(&|m| within(m.sense_range.abs(), 1e-3, 1e3)), "range of the current sense", "0.001 to 1000 A"),
-            (all(&|m| within(m.sense_zero, 0.0, 1.0)), "zero of the current sense", "0 to 1"),
+            (every(motors, |m| within(m.current_limit, 1e-3, 100.0)), "current limit", "0.001 to 100 A"),
+            (every(motors, |m| within(m.resistance, 1e-3, 1e3)), "winding resistance", "0.001 to 1000 ohm"),
+            (every(motors, |m| within(m.inductance, 1e-6, 1.0)), "winding inductance", "0.000001 to 1 H"),
             (
-                all(&|m| within(m.cut_off, m.current_limit, SENSIBLE * m.measurable())),
+                every(motors, |m| within(m.sense_range.abs(), 1e-3, 1e3)),
+                "range of the current sense",
+                "0.001 to 1000 A",
+            ),
+            (every(motors, |m| within(m.sense_zero, 0.0, 1.0)), "zero of the current sense", "0 to 1"),
+            (
+                every(motors, |m| within(m.cut_off, m.current_limit, SENSIBLE * m.measurable())),
                 "cut-off current",
                 "the current limit to 95 % of what the current sense can say in either direction; beyond that it could never cut off",
             ),
@@ -409,6 +416,11 @@ impl NodePage {
             None => Ok(()),
         }
     }
+}
+
+/// Whether all motors are `good`.
+fn every(motors: &[MotorCalibration; AXES], good: impl Fn(&MotorCalibration) -> bool) -> bool {
+    motors.iter().all(good)
 }
 
 /// Whether the rows are of unit length, at right angles, and right-handed.

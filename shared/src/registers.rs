@@ -279,6 +279,8 @@ registers! {
     129 Modules "modules" U32 WhileDisarmed 1 .. 64, 1, "";
     /// After bus-off: 0 recover, 1 stay off until a restart.
     130 BusOff "bus_off" U32 WhileDisarmed 0 .. 1, 1, "";
+    /// While the sensors say what cannot be true: 0 relax, 1 act on zeros, as the paper's observation fault does.
+    131 BlindActs "blind_acts" U32 WhileDisarmed 0 .. 1, 1, "";
     /// What the encoder reads when the joint is straight.
     132 EncoderZero[4] "encoder_zero" U32 WhileDisarmed 0 .. 16383, core::f64::consts::TAU / 16384.0, "rad";
     /// 1 if the encoder counts down while the joint angle grows.
@@ -289,7 +291,7 @@ registers! {
     150 TorqueConstant[2] "torque_constant" F32 WhileDisarmed -1000000 .. 1000000, 1, "torque/A";
     /// Largest current.
     152 CurrentLimit[2] "current_limit" F32 WhileDisarmed 0.001 .. 100, 1, "A";
-    /// Current that cuts the motor off; at least the largest current, and within what the current sense can read.
+    /// Current that cuts the motor off: the largest current to 95 % of what the current sense can read in either direction.
     154 CutOff[2] "cut_off" F32 WhileDisarmed 0.001 .. 200, 1, "A";
     /// Winding resistance.
     156 Resistance[2] "resistance" F32 WhileDisarmed 0.001 .. 1000, 1, "ohm";
@@ -299,6 +301,22 @@ registers! {
     160 SenseRange[2] "sense_range" F32 WhileDisarmed -1000 .. 1000, 1, "A";
     /// Reading of the current sense without current, as a part of the converter's range.
     162 SenseZero[2] "sense_zero" F32 WhileDisarmed 0 .. 1, 1, "";
+    /// Least angle of a joint.
+    164 JointMin[4] "joint_min" F32 WhileDisarmed -3.1 .. -0.05, 1, "rad";
+    /// Greatest angle of a joint.
+    168 JointMax[4] "joint_max" F32 WhileDisarmed 0.05 .. 3.1, 1, "rad";
+    /// Cap of the torque; the policy's limit counts where it is smaller.
+    172 TorqueCap "torque_cap" F32 WhileDisarmed 0.001 .. 1000000, 1, "torque";
+    /// Cap of the slew; likewise.
+    173 SlewCap "slew_cap" F32 WhileDisarmed 0.001 .. 100000000, 1, "torque/s";
+    /// Cap of the motor temperature; likewise.
+    174 TemperatureCap "temperature_cap" F32 WhileDisarmed 30 .. 150, 1, "degC";
+    /// Supply below which the motors relax.
+    175 SupplyUnder "supply_under" F32 WhileDisarmed 6 .. 60, 1, "V";
+    /// Supply above which the motors relax; at least 1.2 times the lower one.
+    176 SupplyOver "supply_over" F32 WhileDisarmed 7.2 .. 60, 1, "V";
+    /// So long without a frame of the station, and the module relaxes and disarms: 0 never, or at least 0.2 s.
+    177 DeadMan "dead_man" U32 WhileDisarmed 0 .. 60000, 0.001, "s";
 }
 
 impl Register {

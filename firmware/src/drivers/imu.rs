@@ -149,6 +149,11 @@ impl<S: SpiDevice> Lsm6dso<S> {
         Ok(Motion { force: turned([ax, ay, az], G_PER_STEP), rate: turned([rx, ry, rz], RATE_PER_STEP) })
     }
 
+    /// What of the module's own frame is in the axes of the chip.
+    pub fn in_its_axes(&self, vector: [f32; 3]) -> [f32; 3] {
+        (self.mounting.transpose() * Vector3::from(vector)).into()
+    }
+
     fn read<const N: usize>(&mut self, register: u8) -> Result<[u8; N], ImuError> {
         let mut content = [0; N];
         self.spi

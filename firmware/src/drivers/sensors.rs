@@ -9,7 +9,7 @@ use embedded_hal::delay::DelayNs;
 use embedded_hal::spi::SpiDevice;
 
 use super::encoder::{As5047p, EncoderError, JointCalibration, SpeedEstimator};
-use super::imu::{ImuError, Lsm6dso};
+use super::imu::{ImuError, Lsm6dso, Motion};
 use crate::attitude::Attitude;
 
 /// Failures in a row that are bridged.
@@ -30,6 +30,9 @@ pub struct Joint<S, D> {
     since: f32,
     failures: u8,
     error: Option<EncoderError>,
+    /// The last reading, if it succeeded.
+    reading: Option<u16>,
+    errors: u32,
 }
 
 impl<S: SpiDevice, D: DelayNs> Joint<S, D> {
@@ -44,12 +47,16 @@ impl<S: SpiDevice, D: DelayNs> Joint<S, D> {
             since: 0.0,
             failures: 0,
             error: None,
+            reading: None,
+            errors: 0,
         }
     }
 
     fn read(&mut self, seconds: f32) {
         self.since += seconds;
-        match self.encoder.angle() {
+        let result = self.encoder.angle();
+        self.reading = result.ok();
+        match result {
             Ok(reading) => {
                 self.angle = self.calibration.angle(reading);
                 self.speed = self.estimator.update(self.angle, self.since);
@@ -57,6 +64,7 @@ impl<S: SpiDevice, D: DelayNs> Joint<S, D> {
             }
             Err(error) => {
                 self.error = Some(error);
+                self.errors = self.errors.saturating_add(1);
                 self.failures = self.failures.saturating_add(1);
                 if self.failures > HOLD {
                     (self.angle, self.speed) = (f32::NAN, f32::NAN);
@@ -65,6 +73,21 @@ impl<S: SpiDevice, D: DelayNs> Joint<S, D> {
             }
         }
     }
+}
+
+/// What the chips read, before calibration.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RawReadings {
+    /// The encoders, if their last reading succeeded.
+    pub encoders: [Option<u16>; MAX_JOINTS],
+    /// Readings of each that failed.
+    pub encoder_errors: [u32; MAX_JOINTS],
+    /// The last specific force in the axes of the inertial sensor, g; not a number before the first.
+    pub force: [f32; 3],
+    /// The last angular rate likewise, rad/s.
+    pub rate: [f32; 3],
+    /// Readings of the inertial sensor that failed.
+    pub imu_errors: u32,
 }
 
 /// The sensors of a module.
@@ -80,13 +103,26 @@ pub struct ModuleSensors<E, I, D> {
     imu_since: f32,
     imu_failures: u8,
     imu_error: Option<ImuError>,
+    imu_errors: u32,
+    /// The last reading of the inertial sensor.
+    motion: Motion,
 }
 
 impl<E: SpiDevice, I: SpiDevice, D: DelayNs> ModuleSensors<E, I, D> {
     /// The sensors of a module whose first `count` joints exist; the others read 0 and their encoders are left alone.
     pub fn new(joints: [Joint<E, D>; MAX_JOINTS], count: usize, imu: Lsm6dso<I>) -> Self {
-        let (attitude, rate) = (Attitude::UNKNOWN, [f32::NAN; 3]);
-        ModuleSensors { joints, count, imu, attitude, rate, imu_since: 0.0, imu_failures: 0, imu_error: None }
+        ModuleSensors {
+            joints,
+            count,
+            imu,
+            attitude: Attitude::UNKNOWN,
+            rate: [f32::NAN; 3],
+            imu_since: 0.0,
+            imu_failures: 0,
+            imu_error: None,
+            imu_errors: 0,
+            motion: Motion { force: [f32::NAN; 3], rate: [f32::NAN; 3] },
+        }
     }
 
     /// Sets up the inertial sensor: at the start, and whenever [`ModuleSensors::imu_lost`].
@@ -111,10 +147,12 @@ impl<E: SpiDevice, I: SpiDevice, D: DelayNs> ModuleSensors<E, I, D> {
             Ok(motion) => {
                 self.attitude.update(motion.rate, motion.force, self.imu_since);
                 self.rate = motion.rate;
+                self.motion = motion;
                 (self.imu_since, self.imu_failures, self.imu_error) = (0.0, 0, None);
             }
             Err(error) => {
                 self.imu_error = Some(error);
+                self.imu_errors = self.imu_errors.saturating_add(1);
                 self.imu_failures = self.imu_failures.saturating_add(1);
                 if self.imu_failures > HOLD {
                     (self.attitude, self.rate) = (Attitude::UNKNOWN, [f32::NAN; 3]);
@@ -133,6 +171,17 @@ impl<E: SpiDevice, I: SpiDevice, D: DelayNs> ModuleSensors<E, I, D> {
     /// What failed in the last sample, for the log: joint by joint, then the inertial sensor.
     pub fn errors(&self) -> ([Option<EncoderError>; MAX_JOINTS], Option<ImuError>) {
         (self.joints.each_ref().map(|joint| joint.error), self.imu_error)
+    }
+
+    /// What the chips read last.
+    pub fn raw(&self) -> RawReadings {
+        RawReadings {
+            encoders: self.joints.each_ref().map(|joint| joint.reading),
+            encoder_errors: self.joints.each_ref().map(|joint| joint.errors),
+            force: self.imu.in_its_axes(self.motion.force),
+            rate: self.imu.in_its_axes(self.motion.rate),
+            imu_errors: self.imu_errors,
+        }
     }
 }
 
@@ -190,6 +239,9 @@ mod tests {
         assert!((sensors.joint_angles[2] + core::f32::consts::FRAC_PI_2).abs() < 1e-6);
         assert_eq!((sensors.torque, sensors.temperature), ([0.5, -0.25], 31.0));
         assert_eq!(module.errors(), ([None; 4], None));
+        let raw = module.raw();
+        assert_eq!((raw.encoders, raw.encoder_errors), ([Some(0), Some(4096), Some(12288), Some(1)], [0; 4]));
+        assert!((raw.force[2] - 1.0).abs() < 1e-3 && raw.rate == [0.0; 3] && raw.imu_errors == 0, "{raw:?}");
         chips.done();
     }
 
@@ -213,11 +265,13 @@ mod tests {
             let bridged = module.sample(1e-3, [0.0; 2], 30.0);
             assert!(bridged.plausible() && bridged.joint_angles == before.joint_angles);
             assert_eq!(module.errors().0[1], Some(EncoderError::MagnetTooWeak));
+            assert_eq!(module.raw().encoders[..2], [Some(100), None]);
             chips.done();
         }
         chips.answer(&[Some(100), None, Some(100), Some(100)], good_imu());
         let blind = module.sample(1e-3, [0.0; 2], 30.0);
         assert!(blind.joint_angles[1].is_nan() && !blind.plausible());
+        assert_eq!(module.raw().encoder_errors, [0, u32::from(HOLD) + 1, 0, 0]);
         assert_eq!(blind.joint_angles[0], before.joint_angles[0], "the others go on");
         chips.answer(&[Some(100); 4], good_imu());
         assert!(module.sample(1e-3, [0.0; 2], 30.0).plausible(), "and it comes back");
@@ -237,6 +291,7 @@ mod tests {
             chips.done();
         }
         assert!(module.imu_lost() && module.errors().1 == Some(ImuError::Stale));
+        assert_eq!(module.raw().imu_errors, 100);
     }
 
     #[test]
