@@ -290,7 +290,7 @@ mod tests {
     use crate::slcan;
     use composer_firmware::controller::BusKind;
     use composer_shared::policy::{IMAGE_SIZE, Policy, random_image};
-    use composer_shared::wire::{EmergencyStop, Message, STATION, StopCommand};
+    use composer_shared::wire::{EmergencyStop, Message, STATION, StopCommand, StopCount};
     use std::fs::File;
     use std::io::{Read, Write};
 
@@ -363,7 +363,8 @@ mod tests {
             one.write_all(b"\r\r\rC\rS8\rO\r").unwrap();
             let heard = frames(&two, |frame| frame.id == 0x180);
             assert!(heard.iter().all(|frame| frame.fd && Message::parse(frame).is_ok()), "{heard:?}");
-            let stop = Message::EmergencyStop(EmergencyStop::new(StopCommand::Stop, 0)).emit(STATION, true);
+            let stop = Message::EmergencyStop(EmergencyStop::new(StopCommand::Stop, 0, StopCount::UNKNOWN))
+                .emit(STATION, true);
             let mut line = Vec::new();
             write_frame(&mut line, &stop);
             one.write_all(&line).unwrap();
