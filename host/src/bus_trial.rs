@@ -164,7 +164,8 @@ impl BusTrial<'_> {
         }
         let mut plan = self.fault.clone();
         let planned = |kind| PlannedFault { kind, at_ns: None, until_ns: None };
-        plan.faults.extend(self.bus.drop.map(|p| planned(FaultKind::Drop(p))));
+        let varied = self.config.vary.lost(&self.config, seed).map(f64::from);
+        plan.faults.extend(self.bus.drop.or(varied.filter(|lost| *lost > 0.0)).map(|p| planned(FaultKind::Drop(p))));
         plan.faults.extend(self.bus.delay.map(|ms| planned(FaultKind::Delay((ms * 1e6) as u64))));
         sil.faults = plan.draw(seed, self.config.robot.modules);
         sil.seed = seed;

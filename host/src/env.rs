@@ -24,6 +24,7 @@ use crate::environment::{Environment, Outcome, PRIVILEGED, View};
 use crate::robot::Robot;
 use crate::sim::{Motion, Snake};
 use crate::tasks::{Judge, Point, Reward, TaskConfig, Verdict};
+use crate::vary::Variation;
 
 /// Faults that training draws for each episode.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -95,6 +96,10 @@ pub struct EnvConfig {
     pub relax_seconds: Option<f32>,
     /// The modules' sensors; what differs from module to module is drawn for each episode.
     pub sensors: SensorModel,
+    /// Torque of each module's motors for the torque they are told, as a factor; nominal for modules that are not named.
+    pub motor_strength: Vec<f32>,
+    /// What every episode draws anew.
+    pub vary: Variation,
 }
 
 impl EnvConfig {
@@ -110,6 +115,8 @@ impl EnvConfig {
             faults: FaultTraining::default(),
             relax_seconds: None,
             sensors: SensorModel::default(),
+            motor_strength: Vec::new(),
+            vary: Variation::default(),
         }
     }
 
@@ -122,9 +129,15 @@ impl EnvConfig {
         self
     }
 
-    /// The start of the episode with this seed: the snake in its scene with its sensors, and the judge.
+    /// The environment of the episode with this seed, with everything that varies drawn.
+    pub fn drawn(self: &Arc<Self>, seed: u64) -> Arc<Self> {
+        if self.vary.is_none() { self.clone() } else { Arc::new(self.vary.draw(self, seed)) }
+    }
+
+    /// The start of the episode with this seed: the snake in its scene with its sensors, and the judge. What varies must have been drawn.
     pub fn start(&self, seed: u64) -> (Snake, Judge) {
         let (mut snake, judge) = Judge::start(&self.task, seed, &self.robot);
+        snake.set_strength(&self.motor_strength);
         snake.fit_sensors(&self.sensors, seed);
         (snake, judge)
     }
@@ -181,6 +194,8 @@ pub fn knows_fault(kind: &FaultKind) -> bool {
 
 /// The state of one episode.
 pub struct SnakeEnv {
+    /// As it was given, and of this episode.
+    base: Arc<EnvConfig>,
     config: Arc<EnvConfig>,
     limits: Limits,
     relax: f32,
@@ -201,10 +216,12 @@ pub struct SnakeEnv {
 impl SnakeEnv {
     /// An environment, reset with seed 0.
     pub fn new(config: Arc<EnvConfig>) -> Self {
+        let base = config.clone();
+        let config = config.drawn(0);
         let (snake, judge) = config.start(0);
         let modules = config.robot.modules;
         let mut env = SnakeEnv {
-            limits: config.robot.limits(),
+            limits: base.robot.limits(),
             relax: relax_factor(
                 (config.control_period * 1e6).round() as u32,
                 config.relax_seconds.unwrap_or_else(|| config.robot.relax_seconds()),
@@ -220,6 +237,7 @@ impl SnakeEnv {
             episode_return: 0.0,
             rng: ChaCha8Rng::seed_from_u64(0),
             snake,
+            base,
             config,
         };
         env.reset(0);
@@ -228,7 +246,8 @@ impl SnakeEnv {
 
     /// Starts an episode with given faults instead of drawn ones.
     pub fn reset_with(&mut self, seed: u64, faults: &[ScheduledFault]) {
-        let config = self.config.clone();
+        let config = self.base.drawn(seed);
+        self.config = config.clone();
         (self.snake, self.judge) = config.start(seed);
         self.rng = ChaCha8Rng::seed_from_u64(seed ^ 0x5eed_fa17);
         self.faults = faults.to_vec();
@@ -349,7 +368,7 @@ impl Environment for SnakeEnv {
             p[8] = hit(self.now.gone);
             p[9] = hit(self.now.weak);
             p[10] = hit(self.now.blind);
-            p[11] = self.delay as f32;
+            p[11] = self.delay as f32 / self.config.finer_by as f32;
             p[15] = left / 10.0;
             view.privileged.push(p);
             view.acts.push(self.now.gone >> module & 1 == 0);

@@ -24,3 +24,4 @@ pub mod sim;
 pub mod stats;
 pub mod tasks;
 pub mod train;
+pub mod vary;

@@ -55,6 +55,7 @@ pub fn mjcf(robot: &Robot, scene: &Scene, options: Options) -> String {
 fn write_model(out: &mut String, robot: &Robot, scene: &Scene, options: Options) -> std::fmt::Result {
     let (length, radius) = (robot.link_length, robot.link_radius);
     let (along, across) = (robot.friction_along, robot.friction_across);
+    let [gx, gy, gz] = robot.gravity_vector();
     writeln!(out, "<mujoco model=\"{}\">", escaped(&robot.name))?;
     writeln!(
         out,
@@ -64,8 +65,8 @@ fn write_model(out: &mut String, robot: &Robot, scene: &Scene, options: Options)
     writeln!(out, "  <compiler angle=\"radian\"/>")?;
     writeln!(
         out,
-        "  <option timestep=\"{}\" gravity=\"0 0 {}\" integrator=\"implicitfast\" cone=\"elliptic\"/>",
-        robot.physics_step, -robot.gravity
+        "  <option timestep=\"{}\" gravity=\"{} {} {}\" integrator=\"implicitfast\" cone=\"elliptic\"/>",
+        robot.physics_step, gx, gy, gz
     )?;
     writeln!(out, "  <default>")?;
     writeln!(out, "    <default class=\"link\">")?;

@@ -58,6 +58,12 @@ pub struct Robot {
     pub contact_damping: f32,
     /// Gravity, units/s^2.
     pub gravity: f32,
+    /// Slope of the ground, degrees. Steeper than the angle whose tangent is the coefficient of friction: the snake slides.
+    #[serde(default)]
+    pub slope: f32,
+    /// The direction in which the ground falls, degrees to the left of the world's x axis (the snake's own at the start).
+    #[serde(default)]
+    pub downhill: f32,
     /// Physics step, s. Smaller: slower and nearer to the truth, in first order.
     pub physics_step: f32,
     /// What solves for the velocities: `direct` ([`crate::sim::chain`]) or `rapier`, its own joints and solver as a second opinion.
@@ -221,6 +227,12 @@ impl Robot {
         if !(self.damping >= 0.0 && self.damping.is_finite()) {
             return invalid(format!("damping = {}; it must be zero or more", self.damping));
         }
+        if !(0.0..=45.0).contains(&self.slope) || !self.downhill.is_finite() {
+            return invalid(format!(
+                "slope = {} and downhill = {}; a slope of 0 to 45 degrees in any direction is possible",
+                self.slope, self.downhill
+            ));
+        }
         let in_a_sample = PERIOD / self.physics_step;
         if in_a_sample < 0.999 || (in_a_sample - in_a_sample.round()).abs() > 1e-3 * in_a_sample {
             return invalid(format!(
@@ -244,6 +256,16 @@ impl Robot {
             ));
         }
         Ok(())
+    }
+
+    /// Gravity in the frame of the ground (z is its normal), units/s^2.
+    pub fn gravity_vector(&self) -> [f32; 3] {
+        if self.slope == 0.0 {
+            return [0.0, 0.0, -self.gravity];
+        }
+        let (sin, cos) = libm::sincosf(self.slope.to_radians());
+        let (left, ahead) = libm::sincosf(self.downhill.to_radians());
+        [self.gravity * sin * ahead, self.gravity * sin * left, -self.gravity * cos]
     }
 
     /// Links in the whole snake.

@@ -16,6 +16,7 @@ use crate::tasks::tube_crossing::TubeCrossing;
 use crate::tasks::wall_climbing::WallClimbing;
 use crate::tasks::{AllRules, TaskConfig, TaskSettings};
 use crate::train::TrainConfig;
+use crate::vary::Variation;
 
 /// Who is told the goal, in settings files.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
@@ -91,6 +92,8 @@ pub struct RunConfig {
     pub faults: FaultTraining,
     /// The modules' sensors.
     pub sensors: SensorModel,
+    /// What every episode of the training draws anew: robot, ground, sensors.
+    pub vary: Variation,
     /// The robot.
     pub robot: Robot,
 }
@@ -175,6 +178,7 @@ impl RunConfig {
             task.validate(&self.robot.with_modules(modules)?).map_err(anyhow::Error::msg)?;
         }
         self.sensors.check().map_err(|error| anyhow::anyhow!("sensors.{error}"))?;
+        self.vary.check(&self.evaluation()).map_err(|error| anyhow::anyhow!("vary.{error}"))?;
         let faults = &self.faults;
         if !(0.0..=1.0).contains(&faults.probability) || !(0.0..1.0).contains(&faults.missed_latents) {
             bail!("faults.probability and faults.missed_latents are shares: 0 to 1");
@@ -192,11 +196,11 @@ impl RunConfig {
             lengths => self.robot.with_modules(lengths[index % lengths.len()])?,
         };
         let faults = self.faults.clone();
-        Ok(Arc::new(EnvConfig { robot, faults, delay: self.env.delay, ..self.evaluation() }))
+        Ok(Arc::new(EnvConfig { robot, faults, delay: self.env.delay, vary: self.vary.clone(), ..self.evaluation() }))
     }
 
     /// The environment that evaluations start from. It is easier than the one of the training: the least delay of those trained with, no missed
-    /// latents, no faults, and the robot's own length.
+    /// latents, no faults, nothing varied, and the robot's own length.
     pub fn evaluation(&self) -> EnvConfig {
         EnvConfig {
             task: self.task(),

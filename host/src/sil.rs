@@ -31,6 +31,7 @@ pub struct SnakePlant {
 impl SnakePlant {
     /// The start of the episode with this seed, the same as [`crate::env::SnakeEnv`]'s.
     pub fn new(config: Arc<EnvConfig>, seed: u64) -> Self {
+        let config = config.drawn(seed);
         let (snake, judge) = config.start(seed);
         let torques = vec![[0; AXES]; config.robot.modules];
         SnakePlant { config, snake, external: None, judge, physics_steps: 0, torques, trace: None }
@@ -41,6 +42,7 @@ impl SnakePlant {
         let plant = SnakePlant::new(config, seed);
         let scene = &plant.judge.course().scene;
         let (external, mut snake) = External::start(elsewhere, &plant.config.robot, scene, seed)?;
+        snake.set_strength(&plant.config.motor_strength);
         snake.fit_sensors(&plant.config.sensors, seed);
         Ok(SnakePlant { snake, external: Some(external), ..plant })
     }

@@ -6,6 +6,7 @@ use anyhow::{Result, bail};
 
 use crate::env::EnvConfig;
 use crate::robot::{Robot, Solver};
+use crate::vary::{LAB, LAB_NAME, Variation};
 
 /// Fields of the robot that an evaluation cannot vary: the policy is made for them, or there is a flag of their own.
 const KEPT: [&str; 8] = [
@@ -31,8 +32,9 @@ pub struct Physics {
     /// Solver of the joints [default: the robot's]
     #[arg(long, value_name = "direct|rapier")]
     pub solver: Option<Solver>,
-    /// Change a number of the robot, such as friction_along=0.15; the policy is not told. May be repeated
-    #[arg(long, value_name = "KEY=VALUE")]
+    /// Change a number of the robot, such as friction_along=0.15, or let every episode draw from the ranges of a file or of `vary-lab`; the
+    /// policy is not told. May be repeated
+    #[arg(long, value_name = "KEY=VALUE|FILE")]
     pub vary: Vec<String>,
 }
 
@@ -59,7 +61,8 @@ impl Physics {
         let known = config.relax_seconds.unwrap_or_else(|| config.robot.relax_seconds());
         // By way of the text, in which a 32-bit number has no more digits than it needs.
         let mut fields: toml::Table = toml::from_str(&config.robot.fingerprint())?;
-        for assignment in &self.vary {
+        let (assignments, files): (Vec<&String>, Vec<&String>) = self.vary.iter().partition(|vary| vary.contains('='));
+        for assignment in assignments {
             vary(&mut fields, assignment)?;
         }
         if let Some(times) = self.tolerance {
@@ -83,8 +86,27 @@ impl Physics {
             config = EnvConfig { robot, relax_seconds: Some(known), ..config };
             config.task.validate(&config.robot).map_err(anyhow::Error::msg)?;
         }
+        match files[..] {
+            [] => {}
+            [file] => config.vary = ranges(file, &config)?,
+            _ => bail!("--vary {}: one set of ranges is possible, but several changes of the form KEY=VALUE", files[1]),
+        }
         Ok(if self.finer > 1 { config.finer(self.finer) } else { config })
     }
+}
+
+/// The set of ranges in a file, or the one that ships.
+fn ranges(file: &str, config: &EnvConfig) -> Result<Variation> {
+    let text = match std::fs::read_to_string(file) {
+        Ok(text) => text,
+        Err(_) if file == LAB_NAME => LAB.into(),
+        Err(error) => bail!(
+            "--vary {file}: no such set of ranges ({error}); write KEY=VALUE, such as friction_along=0.15, or name a file such as host/configs/vary-lab.toml"
+        ),
+    };
+    let set = Variation::from_toml(&text).map_err(|error| anyhow::anyhow!("--vary {file}: {error}"))?;
+    set.check(config).map_err(|error| anyhow::anyhow!("--vary {file}: {error}"))?;
+    Ok(set)
 }
 
 /// Changes one number of a robot.
@@ -151,7 +173,7 @@ mod tests {
             );
         }
         for (assignment, words) in [
-            ("gravity", "write KEY=VALUE"),
+            ("gravity", "--vary gravity: no such set of ranges"),
             ("gravity=down", "gravity=down: the value must be a number such as 196.2"),
             ("solver_iterations=1.5", "must be a number such as 60"),
             ("link_mass=-1", "link_mass = -1"),

@@ -440,7 +440,7 @@ impl Chain {
             contacts: Vec::new(),
             solids,
             block,
-            gravity: Vec3A::new(0.0, 0.0, -robot.gravity),
+            gravity: Vec3A::from(robot.gravity_vector()),
             effort: Effort::default(),
         };
         chain.links[0].anchor = Vec3A::new(0.5 * robot.link_length, 0.0, robot.link_radius);

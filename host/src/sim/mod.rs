@@ -111,6 +111,9 @@ pub struct Snake {
     /// Torque on each axis of each module now, and where it is heading.
     torque: Vec<[f32; AXES]>,
     command: Vec<[f32; AXES]>,
+    /// Torque of each module's motors for a torque of 1, and what acts on the joints.
+    strength: Vec<f32>,
+    acting: Vec<[f32; AXES]>,
     motion: Motion,
     block: Option<scene::Block>,
     /// Sensors as their datasheets have them; without, a module senses the truth.
@@ -161,6 +164,8 @@ impl Snake {
             },
             torque: vec![[0.0; AXES]; robot.modules],
             command: vec![[0.0; AXES]; robot.modules],
+            strength: vec![1.0; robot.modules],
+            acting: vec![[0.0; AXES]; robot.modules],
             motion: Motion::default(),
             block: scene.block,
             suites: Vec::new(),
@@ -176,7 +181,7 @@ impl Snake {
         self.suites = (0..self.robot.modules)
             .map(|module| {
                 let mut sensors = ModuleSensorState::new(model, crate::methods::mix(seed ^ (module as u64) << 32));
-                let force = self.own_link(module).seen([0.0, 0.0, 1.0]);
+                let force = self.own_link(module).seen(self.up());
                 sensors.rest(&self.truth(module, force, [0.0; 3]));
                 Suite { sensors, mean: Mean::default(), velocity: Vector::ZERO }
             })
@@ -201,13 +206,14 @@ impl Snake {
     /// Lets the sensors feel the last physics step, and sample when it is time.
     fn sense(&mut self) {
         let (dt, gravity) = (self.robot.physics_step, self.robot.gravity);
+        let fall = Vector::from(self.robot.gravity_vector());
         self.steps += 1;
         let sample = self.steps.is_multiple_of((PERIOD / dt).round().max(1.0) as usize);
         for module in 0..self.suites.len() {
             let own = *self.own_link(module);
             let suite = &mut self.suites[module];
             let velocity = Vector::from(own.linear);
-            let force = ((velocity - suite.velocity) / dt + gravity * Vector::Z) / gravity;
+            let force = ((velocity - suite.velocity) / dt - fall) / gravity;
             suite.velocity = velocity;
             suite.mean.add(own.seen(force.to_array()), own.seen(own.angular), dt);
             if sample {
@@ -216,6 +222,16 @@ impl Snake {
                 self.suites[module].sensors.update(&truth);
             }
         }
+    }
+
+    /// The direction against gravity, a unit vector.
+    fn up(&self) -> [f32; 3] {
+        self.robot.gravity_vector().map(|g| -g / self.robot.gravity)
+    }
+
+    /// How strong each module's motors are, as a factor of the torque they are told; those that are not named are nominal.
+    pub fn set_strength(&mut self, strength: &[f32]) {
+        self.strength.iter_mut().zip(strength).for_each(|(own, new)| *own = *new);
     }
 
     /// The robot.
@@ -233,7 +249,7 @@ impl Snake {
         self.command[module] = torque.map(|t| t.clamp(-self.robot.torque_limit, self.robot.torque_limit));
     }
 
-    /// The torque that acts on the joints of a module now.
+    /// The torque that a module's motors are told now; a motor that is not nominal puts another one on its joints.
     pub fn torque(&self, module: usize) -> [f32; AXES] {
         self.torque[module]
     }
@@ -241,20 +257,21 @@ impl Snake {
     /// Lets the motors slew for one physics step, and returns the torques that act in it: yaw and pitch of each module.
     pub fn slew(&mut self) -> &[[f32; AXES]] {
         let step = self.robot.torque_slew * self.robot.physics_step;
-        for (torque, command) in self.torque.iter_mut().zip(&self.command) {
+        for (module, (torque, command)) in self.torque.iter_mut().zip(&self.command).enumerate() {
             for axis in 0..AXES {
                 torque[axis] = robot::slew(torque[axis], command[axis], step);
+                self.acting[module][axis] = self.strength[module] * torque[axis];
             }
         }
-        &self.torque
+        &self.acting
     }
 
     /// Advances by one physics step.
     pub fn step(&mut self) {
         self.slew();
         match &mut self.engine {
-            Engine::Direct(chain) => chain.step(&self.robot, &self.torque),
-            Engine::Rapier(world) => world.step(&self.robot, &self.torque, &self.state.joint_speeds),
+            Engine::Direct(chain) => chain.step(&self.robot, &self.acting),
+            Engine::Rapier(world) => world.step(&self.robot, &self.acting, &self.state.joint_speeds),
             Engine::Mirror => {}
         }
         self.read();
@@ -341,7 +358,7 @@ impl Snake {
         Sensors {
             joint_angles: truth.joint_angles,
             joint_speeds: truth.joint_speeds,
-            up: own.seen([0.0, 0.0, 1.0]),
+            up: own.seen(self.up()),
             angular_rate: own.seen(own.angular),
             torque,
             temperature: AMBIENT,
@@ -393,16 +410,18 @@ impl Snake {
     pub fn energy(&self) -> f32 {
         let robot = &self.robot;
         let square = |v: [f32; 3]| v.iter().map(|x| x * x).sum::<f32>();
+        let fall = Vector::from(robot.gravity_vector());
+        let lifted = |position: [f32; 3]| -fall.dot(Vector::from(position));
         let links = self.state.links.iter().map(|link| {
             0.5 * robot.link_mass * square(link.linear)
                 + 0.5 * robot.link_inertia * square(link.angular)
-                + robot.link_mass * robot.gravity * link.position[2]
+                + robot.link_mass * lifted(link.position)
         });
         let springs = self.state.joint_angles.iter().map(|angle| 0.5 * robot.stiffness * angle * angle);
         let block = self.state.block.zip(self.block).map_or(0.0, |(state, block)| {
             let spin = state.seen(state.angular);
             let turning: f32 = spin.iter().zip(block.moments()).map(|(w, moment)| 0.5 * moment * w * w).sum();
-            turning + block.mass * (0.5 * square(state.linear) + robot.gravity * state.position[2])
+            turning + block.mass * (0.5 * square(state.linear) + lifted(state.position))
         });
         links.sum::<f32>() + springs.sum::<f32>() + block
     }

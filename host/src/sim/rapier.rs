@@ -65,7 +65,7 @@ pub struct RapierSnake {
 impl RapierSnake {
     /// A straight snake at rest, its head link centred at the origin, in a scene.
     pub fn new(robot: &Robot, scene: &Scene) -> Self {
-        let mut world = PhysicsWorld { gravity: Vector::new(0.0, 0.0, -robot.gravity), ..PhysicsWorld::default() };
+        let mut world = PhysicsWorld { gravity: Vector::from(robot.gravity_vector()), ..PhysicsWorld::default() };
         let parameters = &mut world.integration_parameters;
         parameters.dt = robot.physics_step / robot.rapier_substeps as f32;
         parameters.num_solver_iterations = robot.rapier_iterations;
