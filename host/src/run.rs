@@ -8,6 +8,7 @@ use composer_sim_bridge::sensor_model::SensorModel;
 use serde::{Deserialize, Serialize};
 
 use crate::env::{EnvConfig, FaultTraining};
+use crate::methods::TrainConfig;
 use crate::robot::Robot;
 use crate::tasks::block_pushing::BlockPushing;
 use crate::tasks::goal_reaching::GoalReaching;
@@ -15,7 +16,6 @@ use crate::tasks::shape_formation::ShapeFormation;
 use crate::tasks::tube_crossing::TubeCrossing;
 use crate::tasks::wall_climbing::WallClimbing;
 use crate::tasks::{AllRules, TaskConfig, TaskSettings};
-use crate::train::TrainConfig;
 use crate::vary::Variation;
 
 /// Who is told the goal, in settings files.

@@ -14,7 +14,7 @@ use super::PolicySource;
 use crate::env::{EnvConfig, SnakeEnv};
 use crate::environment::{Environment, Told, Trivial, View};
 use crate::eval::{DEFAULT_SEED, episode_seed, parallel};
-use crate::methods::{Differentiation, Method, mix};
+use crate::methods::{Differentiation, Method, Times, TrainConfig, mix};
 use crate::mjcf::mjcf;
 use crate::policy::{Policy, Random};
 use crate::robot::{Robot, Solver};
@@ -22,8 +22,7 @@ use crate::run::RunConfig;
 use crate::sil::SnakePlant;
 use crate::sim::open_loop::Experiment;
 use crate::sim::{Scene, Snake};
-use crate::train::progress::Times;
-use crate::train::{TrainConfig, Trainer};
+use crate::train::Trainer;
 
 /// Lengths at which cost is measured.
 const LENGTHS: [usize; 4] = [8, 16, 32, 64];

@@ -6,7 +6,7 @@ use anyhow::{Context, Result, bail};
 use composer_shared::policy::{Policy, Task};
 
 use crate::env::EnvConfig;
-use crate::network::Network;
+use crate::methods::TrainedPolicy;
 use crate::policy;
 use crate::robot::Robot;
 use crate::run::RunConfig;
@@ -98,8 +98,8 @@ fn shipped_manifest(name: &str) -> Option<&'static str> {
 pub enum PolicySource {
     /// A frozen integer policy image.
     Image(Box<Frozen>),
-    /// The float network of a training run, with its settings.
-    Run(Box<(Network, RunConfig)>),
+    /// The policy of a training run, with its settings.
+    Run(Box<(TrainedPolicy, RunConfig)>),
     /// No policy: baselines.
     Still,
     /// No policy: baselines.
@@ -111,8 +111,8 @@ impl PolicySource {
     pub fn load(name: &str) -> Result<Self> {
         let path = Path::new(name);
         if path.is_dir() {
-            let (config, network) = load_run(path)?;
-            return Ok(PolicySource::Run(Box::new((network, config))));
+            let (config, policy) = load_run(path)?;
+            return Ok(PolicySource::Run(Box::new((policy, config))));
         }
         if path.is_file() {
             let image = std::fs::read(path).with_context(|| format!("cannot read {name}"))?;
@@ -231,7 +231,7 @@ fn check(policy: &Policy, robot: &Robot) -> Result<()> {
 
 /// Settings of a run, in its folder.
 pub const CONFIG_FILE: &str = "config.toml";
-/// Float network of a run as of its last evaluation, in its folder.
+/// Policy of a run as of its last evaluation, in its folder.
 pub const NETWORK_FILE: &str = "network.json";
 
 /// Reads a settings file.
@@ -241,17 +241,18 @@ pub fn load_config(path: &Path) -> Result<RunConfig> {
         .map_err(|e| anyhow::anyhow!("{} has settings that do not fit: {}", path.display(), e.message()))
 }
 
-/// The settings and the network of a run folder.
-pub fn load_run(folder: &Path) -> Result<(RunConfig, Network)> {
+/// The settings and the policy of a run folder.
+pub fn load_run(folder: &Path) -> Result<(RunConfig, TrainedPolicy)> {
     let config = load_config(&folder.join(CONFIG_FILE))
         .with_context(|| format!("{} is no folder of a training run", folder.display()))?;
     let path = folder.join(NETWORK_FILE);
     let text = std::fs::read(&path).with_context(|| {
         format!("cannot read {}; a run writes it at its first evaluation and at its end", path.display())
     })?;
-    let network: Network = serde_json::from_slice(&text).with_context(|| format!("{} is damaged", path.display()))?;
-    network.check().with_context(|| format!("{} is damaged", path.display()))?;
-    Ok((config, network))
+    let policy: TrainedPolicy =
+        serde_json::from_slice(&text).with_context(|| format!("{} is damaged", path.display()))?;
+    policy.check().with_context(|| format!("{} is damaged", path.display()))?;
+    Ok((config, policy))
 }
 
 #[cfg(test)]

@@ -12,8 +12,7 @@ use super::task_by_name;
 use crate::env::SnakeEnv;
 use crate::eval::{Trial, curve_seed, healthy};
 use crate::files::{create_folder, write_whole};
-use crate::methods::Method;
-use crate::network::Network;
+use crate::methods::{Method, TrainedPolicy};
 use crate::outcome::Report;
 use crate::robot::Robot;
 use crate::run::RunConfig;
@@ -104,7 +103,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
 }
 
 /// Starts a run in the folder `out`, or goes on with the one that is there. Judges the policy every so often, healthy and (if it trains with
-/// faults) faulty, and keeps the network of the last judgement. `name`: as in [`train()`].
+/// faults) faulty, and keeps the policy of the last judgement. `name`: as in [`train()`].
 pub fn train_in(config: &RunConfig, out: &Path, resuming: bool, name: Option<&str>) -> Result<TrainSummary> {
     create_folder(out)?;
     if !resuming {
@@ -115,7 +114,7 @@ pub fn train_in(config: &RunConfig, out: &Path, resuming: bool, name: Option<&st
     }
     let evaluation = Arc::new(config.evaluation());
     let faulty = |seed, modules| config.faults.draw(seed, modules);
-    let mut judge = |network: &Network, _steps: u64| {
+    let mut evaluate = |policy: &TrainedPolicy, _steps: u64| {
         let trial = Trial {
             config: &evaluation,
             episodes: config.train.evaluation_episodes.max(1) as usize,
@@ -123,21 +122,21 @@ pub fn train_in(config: &RunConfig, out: &Path, resuming: bool, name: Option<&st
             faults: &healthy,
             threads: config.train.threads(),
         };
-        let report = trial.evaluate(network, "none", &|| {});
+        let report = trial.evaluate(policy, "none", &|| {});
         let mut scalars = scalars(&report, "evaluation");
         if config.faults.probability > 0.0 {
-            let report = Trial { faults: &faulty, ..trial }.evaluate(network, "as trained", &|| {});
+            let report = Trial { faults: &faulty, ..trial }.evaluate(policy, "as trained", &|| {});
             scalars.extend(self::scalars(&report, "evaluation_faults"));
         }
         // A run that is killed keeps the policy of its last evaluation; a failure to write shows at the checkpoint.
-        let _ = save_network(out, network);
+        let _ = save_policy(out, policy);
         scalars
     };
     let make = |index: usize| -> Result<Box<dyn crate::environment::Environment>> {
         Ok(Box::new(SnakeEnv::new(config.environment(index)?)))
     };
-    let summary = train(&config.train, &make, &fingerprint(config), out, resuming, name, &mut judge)?;
-    save_network(out, &summary.network)?;
+    let summary = train(&config.train, &make, &fingerprint(config), out, resuming, name, &mut evaluate)?;
+    save_policy(out, &summary.policy)?;
     Ok(summary)
 }
 
@@ -155,8 +154,8 @@ fn scalars(report: &Report, prefix: &str) -> Vec<(String, f64)> {
     .collect()
 }
 
-fn save_network(out: &Path, network: &Network) -> Result<()> {
-    let text = serde_json::to_vec(network).context("the network cannot be written as JSON")?;
+fn save_policy(out: &Path, policy: &TrainedPolicy) -> Result<()> {
+    let text = serde_json::to_vec(policy).context("the policy cannot be written as JSON")?;
     write_whole(&out.join(NETWORK_FILE), &text)
 }
 

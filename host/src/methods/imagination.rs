@@ -26,7 +26,7 @@
 use anyhow::{Result, bail};
 use serde::{Deserialize, Serialize};
 
-use super::actor::Actor;
+use super::on_policy::Companion;
 use crate::environment::Environment;
 use crate::tasks::Point;
 
@@ -78,32 +78,40 @@ impl ImaginationConfig {
     }
 }
 
-/// The imagination policy of an iteration.
-#[derive(Clone, Copy)]
-pub struct Imagination<'a> {
-    /// Its actor.
-    pub policy: &'a Actor,
-    /// Seed of its random streams.
-    pub seed: u64,
+/// Rules of the imagination policy.
+#[derive(Clone, Copy, Debug)]
+pub struct Imagination {
     /// Longest displacement, units.
     pub bound: f32,
     /// Weight of the following error in the control policy's reward.
     pub follow: f32,
 }
 
-impl Imagination<'_> {
-    /// Where the modules of an environment are imagined to be after the next step, given the actions u; world frame, units.
-    pub fn imagine(
-        &self,
-        environment: &dyn Environment,
-        acts: &[bool],
-        actions: &[[f32; DISPLACEMENT]],
-        to: &mut Vec<Point>,
-    ) {
-        to.clear();
-        to.extend(acts.iter().zip(actions).enumerate().map(|(module, (acts, action))| {
+impl Companion for Imagination {
+    fn name(&self) -> &'static str {
+        "imagination"
+    }
+
+    fn error_name(&self) -> &'static str {
+        "follow_error"
+    }
+
+    /// Where the modules are imagined to be after the next step, given the actions u; world frame, units.
+    fn plan(&self, environment: &dyn Environment, acts: &[bool], actions: &[f32], plan: &mut Vec<Point>) -> f32 {
+        let actions = actions.as_chunks::<DISPLACEMENT>().0;
+        plan.clear();
+        plan.extend(acts.iter().zip(actions).enumerate().map(|(module, (acts, action))| {
             environment.place(module, if *acts { displacement(*action, self.bound) } else { [0.0; DISPLACEMENT] })
         }));
+        environment.imagined_reward(plan)
+    }
+
+    fn error(&self, environment: &dyn Environment, acts: &[bool], plan: &[Point]) -> f32 {
+        follow_error(environment, acts, plan)
+    }
+
+    fn weight(&self) -> f32 {
+        self.follow
     }
 }
 
@@ -141,12 +149,11 @@ mod tests {
     #[test]
     fn a_dead_module_stays_and_is_left_out_of_the_following_error() {
         let team = Trivial::new(3, Told::All);
-        let layout = crate::methods::actor_critic::ActorLayout::imagination();
-        let policy = Actor::new(layout, &vec![0.0; layout.len]);
-        let imagination = Imagination { policy: &policy, seed: 0, bound: 1.0, follow: 1.0 };
+        let imagination = Imagination { bound: 1.0, follow: 1.0 };
         let acts = [true, false, true];
         let mut imagined = Vec::new();
-        imagination.imagine(&team, &acts, &[[0.5, 0.0, 0.0], [0.9; 3], [0.0, 0.0, 0.25]], &mut imagined);
+        let actions = [[0.5, 0.0, 0.0], [0.9; 3], [0.0, 0.0, 0.25]];
+        imagination.plan(&team, &acts, actions.as_flattened(), &mut imagined);
         assert_eq!(imagined, [[0.5, 0.0, 0.0], [0.0; 3], [0.0, 0.0, 0.25]]);
         imagined[1] = [100.0; 3];
         assert_eq!(follow_error(&team, &acts, &imagined), 0.375);

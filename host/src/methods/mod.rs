@@ -1,27 +1,31 @@
-//! The learning methods: one policy shared by all modules, trained with PPO against a critic that sees the whole team.
+//! The learning methods, one file each, and what they share.
 //!
-//! What is shared by all methods lives here: flat parameters with named blocks, orthogonal initialisation, Adam, and the rule by
-//! which every random stream is derived from the seed of the run, and the threads that share the work.
+//! A method is an [`Algorithm`]: it iterates, hands over its policy, saves and loads. [`on_policy`] is one for every method that brings its
+//! networks as an [`on_policy::ActorCritic`]. What they share further: flat parameters with an optimiser ([`parameters`]), normalisers
+//! ([`normalise`]), random streams ([`random`]) and threads ([`workers`]).
 
-pub mod actor;
-pub mod actor_critic;
-pub mod autodiff;
-pub mod buffer;
-pub mod critic;
-pub mod fused;
+pub mod composer;
+pub mod config;
 pub mod imagination;
 pub(crate) mod kernels;
 pub mod normalise;
-pub mod ppo;
-pub mod rollout;
+pub mod on_policy;
+pub mod parameters;
+pub mod random;
 pub(crate) mod simd;
+pub mod workers;
 
-use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
-use rand::{Rng, RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
-use rayon::iter::{IntoParallelRefMutIterator, ParallelIterator};
+use anyhow::{Result, bail};
 use serde::{Deserialize, Serialize};
+
+pub use self::composer::Differentiation;
+pub use self::config::TrainConfig;
+pub(crate) use self::random::mix;
+use crate::environment::{Environment, Outcome, View};
+use crate::network::Network;
+use crate::policy::Policy;
 
 /// How a policy is built and trained.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -85,294 +89,201 @@ impl std::str::FromStr for Method {
     }
 }
 
-/// Which code computes the gradients.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Differentiation {
-    /// The backward passes written by hand for these two networks ([`actor`], [`critic`]).
-    #[default]
-    Manual,
-    /// burn's automatic differentiation ([`autodiff`]): several times slower, the same up to rounding. The reference for the former and
-    /// where to begin with a network of another kind.
-    Automatic,
-}
+/// Makes the environment of an index. The same index must always give the same environment.
+pub type MakeEnvironment<'a> = &'a dyn Fn(usize) -> Result<Box<dyn Environment>>;
 
-/// The threads of a run. They live as long as this and its clones do.
-#[derive(Clone, Debug)]
-pub struct Workers {
-    pool: Arc<rayon::ThreadPool>,
-}
-
-impl Workers {
-    /// Starts so many threads.
+/// A learning method with all that it has learnt so far.
+pub trait Algorithm: Send {
+    /// Collects experience and learns once.
     ///
     /// # Errors
     ///
-    /// If the system does not give them.
-    pub fn new(threads: usize) -> anyhow::Result<Self> {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.max(1)).build()?;
-        Ok(Self { pool: Arc::new(pool) })
-    }
+    /// If training diverged.
+    fn iterate(&mut self) -> Result<Report>;
 
-    /// How many there are.
-    pub fn threads(&self) -> usize {
-        self.pool.current_num_threads()
-    }
+    /// The policy as it is now.
+    fn policy(&self) -> TrainedPolicy;
 
-    /// Runs `work` on one of the threads: what it asks the workers for in turn then starts without a switch of threads.
-    pub fn enter<R: Send>(&self, work: impl FnOnce() -> R + Send) -> R {
-        self.pool.install(work)
-    }
+    /// Iterations done.
+    fn iteration(&self) -> u64;
 
-    /// Applies `task` to every item; whoever is free takes the next. Each thread has an entry of `scratch` for itself meanwhile, so there
-    /// should be as many as threads.
-    pub fn for_each<I, S>(&self, items: I, scratch: &mut [S], task: impl Fn(I::Item, &mut S) + Sync)
-    where
-        I: IntoIterator,
-        I::IntoIter: Send,
-        S: Send,
-    {
-        let items = Mutex::new(items.into_iter());
-        self.pool.install(|| {
-            scratch.par_iter_mut().for_each(|scratch| {
-                loop {
-                    // The lock is held only to take the next item.
-                    let next = items.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).next();
-                    let Some(item) = next else { return };
-                    task(item, scratch);
-                }
-            });
-        });
-    }
+    /// Environment steps in an iteration.
+    fn steps_per_iteration(&self) -> u64;
 
-    /// Runs both, side by side if two threads are free.
-    pub fn join<A: Send, B: Send>(&self, a: impl FnOnce() -> A + Send, b: impl FnOnce() -> B + Send) -> (A, B) {
-        self.pool.join(a, b)
-    }
+    /// All that [`Algorithm::load`] needs to go on bit for bit.
+    fn save(&self) -> State;
+
+    /// Brings a new one to where another was.
+    ///
+    /// # Errors
+    ///
+    /// If that was of another method, other settings or another version.
+    fn load(&mut self, state: &State, make: MakeEnvironment) -> Result<()>;
 }
 
-/// What a random stream is for. No state of a generator is ever stored: each use has a stream of its own, derived from the seed of the
-/// run, so that a resumed run draws what the uninterrupted one would have drawn.
-#[derive(Clone, Copy, Debug)]
-pub enum Stream {
-    /// Initial weights.
-    Weights = 1,
-    /// Seeds of episodes.
-    Episode = 2,
-    /// Noise on the actions of a rollout.
-    Noise = 3,
-    /// Order of the samples in the minibatches.
-    Shuffle = 4,
-    /// Seed of all streams of the imagination policy, which stands for the run's in them.
-    Imagination = 5,
-}
-
-/// Seed of the stream `stream` of a run, numbered by (`major`, `minor`): iteration and environment, say.
-pub fn derive_seed(run_seed: u64, stream: Stream, major: u64, minor: u64) -> u64 {
-    // SplitMix64's finaliser over each part in turn: changing any bit of any part changes about half of the result's bits.
-    [stream as u64, major, minor].into_iter().fold(mix(run_seed), |state, part| mix(state ^ mix(part)))
-}
-
-/// SplitMix64's finaliser.
-pub(crate) fn mix(x: u64) -> u64 {
-    let mut z = x.wrapping_add(0x9e37_79b9_7f4a_7c15);
-    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    z ^ (z >> 31)
-}
-
-/// The generator of a stream (see [`derive_seed`]).
-pub fn stream(run_seed: u64, stream: Stream, major: u64, minor: u64) -> ChaCha8Rng {
-    ChaCha8Rng::seed_from_u64(derive_seed(run_seed, stream, major, minor))
-}
-
-/// Two independent standard normal numbers (Box-Muller).
-pub fn normal_pair(rng: &mut impl Rng) -> [f32; 2] {
-    // 1 - u is in (0, 1]: its logarithm is finite.
-    let radius = (-2.0 * (1.0 - rng.random::<f64>()).ln()).sqrt();
-    let (sin, cos) = (std::f64::consts::TAU * rng.random::<f64>()).sin_cos();
-    [(radius * cos) as f32, (radius * sin) as f32]
-}
-
-/// A named matrix inside a flat parameter vector, row-major, one row per output.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Block {
-    /// What the matrix is.
-    pub name: &'static str,
-    /// Outputs.
-    pub rows: usize,
-    /// Inputs.
-    pub columns: usize,
-    /// Where the matrix starts in the vector.
-    pub offset: usize,
-}
-
-impl Block {
-    /// Numbers in the block.
-    pub fn len(&self) -> usize {
-        self.rows * self.columns
-    }
-
-    /// Whether the block holds nothing.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-
-    /// The block's place in the vector.
-    pub fn range(&self) -> std::ops::Range<usize> {
-        self.offset..self.offset + self.len()
-    }
-}
-
-/// Lays blocks out one after the other. Returns them and their total length.
-pub(crate) fn lay_out<const N: usize>(blocks: [(&'static str, usize, usize); N]) -> ([Block; N], usize) {
-    let mut offset = 0;
-    let blocks = blocks.map(|(name, rows, columns)| {
-        let block = Block { name, rows, columns, offset };
-        offset += block.len();
-        block
-    });
-    (blocks, offset)
-}
-
-/// A random (semi-)orthogonal matrix times `gain`, row-major: orthonormal rows if `rows <= columns`, else orthonormal columns.
-pub fn orthogonal(rows: usize, columns: usize, gain: f32, rng: &mut impl Rng) -> Vec<f32> {
-    let (count, length) = (rows.min(columns), rows.max(columns));
-    let mut basis: Vec<Vec<f64>> = Vec::with_capacity(count);
-    while basis.len() < count {
-        let mut v: Vec<f64> =
-            (0..length.div_ceil(2)).flat_map(|_| normal_pair(rng)).map(f64::from).take(length).collect();
-        // Gram-Schmidt, twice: once alone leaves rounding errors in the last vectors.
-        for _ in 0..2 {
-            for b in &basis {
-                let dot: f64 = v.iter().zip(b).map(|(x, y)| x * y).sum();
-                v.iter_mut().zip(b).for_each(|(x, y)| *x -= dot * y);
-            }
+/// A run of the method that the settings name, which has not begun.
+///
+/// # Errors
+///
+/// If the settings are not possible, or an environment cannot be made.
+pub fn create(config: &TrainConfig, make: MakeEnvironment) -> Result<Box<dyn Algorithm>> {
+    config.validate()?;
+    Ok(match config.method {
+        Method::Composer | Method::ComposerNoImagination | Method::ComposerNoAttention | Method::Mappo => {
+            Box::new(composer::new(config, make)?)
         }
-        let norm = v.iter().map(|x| x * x).sum::<f64>().sqrt();
-        if norm > 1e-6 {
-            basis.push(v.into_iter().map(|x| x / norm).collect());
+    })
+}
+
+/// What training hands over: a policy with all that it needs.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum TrainedPolicy {
+    /// The network of COMPOSER or one of its ablations, which can be frozen.
+    Composer(Network),
+}
+
+impl TrainedPolicy {
+    /// The network that can be frozen to integers and run on modules.
+    ///
+    /// # Errors
+    ///
+    /// If the method has none.
+    pub fn network(&self) -> Result<&Network> {
+        match self {
+            TrainedPolicy::Composer(network) => Ok(network),
         }
     }
-    let at = |r: usize, c: usize| if rows <= columns { basis[r][c] } else { basis[c][r] };
-    (0..rows * columns).map(|i| gain * at(i / columns, i % columns) as f32).collect()
+
+    /// Says what is wrong with it, if anything is.
+    pub fn check(&self) -> Result<()> {
+        match self {
+            TrainedPolicy::Composer(network) => Ok(network.check()?),
+        }
+    }
 }
 
-/// The Adam optimiser over a flat parameter vector (Kingma and Ba, 2015), without weight decay.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Adam {
-    /// Running mean of the gradient.
-    pub first: Vec<f32>,
-    /// Running mean of its square.
-    pub second: Vec<f32>,
-    /// Steps taken.
+impl Policy for TrainedPolicy {
+    fn act(&self, view: &View, noise: u64, actions: &mut Vec<[f32; 2]>, attention: Option<&mut Vec<f32>>) {
+        match self {
+            TrainedPolicy::Composer(network) => Policy::act(network, view, noise, actions, attention),
+        }
+    }
+}
+
+/// What an iteration did.
+#[derive(Clone, Debug)]
+pub struct Report {
+    /// Where the time went.
+    pub times: Times,
+    /// The same seed always gives the same numbers here.
+    pub scalars: Vec<(String, f64)>,
+}
+
+impl Report {
+    /// The number of that name; NaN if there is none.
+    pub fn get(&self, name: &str) -> f64 {
+        self.scalars.iter().find(|(key, _)| key == name).map_or(f64::NAN, |(_, value)| *value)
+    }
+}
+
+/// Where the time of some iterations went, wall time on all cores but for the two parts of the rollout.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Times {
+    /// Environment steps.
     pub steps: u64,
-    /// Added to the root of the second moment.
-    pub epsilon: f32,
+    /// Wall time.
+    pub wall: Duration,
+    /// Wall time of the rollouts, the part spent in the environments.
+    pub physics: Duration,
+    /// Wall time of the rollouts, the part spent in the policy and in book-keeping.
+    pub inference: Duration,
+    /// Wall time of the updates.
+    pub update: Duration,
 }
 
-impl Adam {
-    const BETA: [f64; 2] = [0.9, 0.999];
-
-    /// For `parameters` numbers.
-    pub fn new(parameters: usize, epsilon: f32) -> Self {
-        Self { first: vec![0.0; parameters], second: vec![0.0; parameters], steps: 0, epsilon }
+impl Times {
+    /// Adds another span of time.
+    pub fn add(&mut self, other: &Times) {
+        self.steps += other.steps;
+        self.wall += other.wall;
+        self.physics += other.physics;
+        self.inference += other.inference;
+        self.update += other.update;
     }
 
-    /// One step against `gradient`.
-    pub fn step(&mut self, parameters: &mut [f32], gradient: &[f32], learning_rate: f32) {
-        self.steps += 1;
-        let [beta1, beta2] = Self::BETA;
-        let power = i32::try_from(self.steps).unwrap_or(i32::MAX);
-        let rate = (f64::from(learning_rate) / (1.0 - beta1.powi(power))) as f32;
-        let scale = (1.0 / (1.0 - beta2.powi(power)).sqrt()) as f32;
-        let (beta1, beta2) = (beta1 as f32, beta2 as f32);
-        for (((p, g), m), v) in parameters.iter_mut().zip(gradient).zip(&mut self.first).zip(&mut self.second) {
-            *m = beta1 * *m + (1.0 - beta1) * g;
-            *v = beta2 * *v + (1.0 - beta2) * g * g;
-            *p -= rate * *m / (v.sqrt() * scale + self.epsilon);
-        }
+    /// Environment steps per second.
+    pub fn steps_per_second(&self) -> f64 {
+        self.steps as f64 / self.wall.as_secs_f64().max(1e-9)
+    }
+
+    /// Shares of physics, inference and update, 0 to 1.
+    pub fn shares(&self) -> [f64; 3] {
+        let total = (self.physics + self.inference + self.update).as_secs_f64().max(1e-9);
+        [self.physics, self.inference, self.update].map(|part| part.as_secs_f64() / total)
     }
 }
 
-/// Scales `gradient` down to a norm of at most `limit`, over all of it (not per matrix). Returns the norm it had.
-pub fn clip_norm(gradient: &mut [f32], limit: f32) -> f32 {
-    let norm = gradient.iter().map(|g| f64::from(*g) * f64::from(*g)).sum::<f64>().sqrt() as f32;
-    if norm > limit {
-        let scale = limit / norm;
-        gradient.iter_mut().for_each(|g| *g *= scale);
+/// The state of an algorithm between two iterations.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct State {
+    /// Iterations done.
+    pub iteration: u64,
+    /// What each of its policies has learnt, the control policy first.
+    pub learners: Vec<LearnerState>,
+    /// Statistics: whatever numbers the normalisers are made of.
+    pub statistics: Vec<f64>,
+    /// One entry per environment.
+    pub episodes: Vec<EpisodeState>,
+}
+
+/// A running episode of one environment: replaying its actions after the reset leads back to where it was.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct EpisodeState {
+    /// Its number, which gives its seed.
+    pub number: u64,
+    /// Actions since the reset.
+    pub actions: Vec<[f32; 2]>,
+}
+
+/// One policy and its critic.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct LearnerState {
+    /// Steps taken by the actor's and the critic's optimiser.
+    pub adam_steps: [u64; 2],
+    /// Parameters, then both moments of Adam: of the actor, then of the critic.
+    pub parameters: [Vec<f32>; 6],
+    /// Statistics of the returns.
+    pub value_norm: [f64; 3],
+    /// Learning rate of the next update, if it is adapted.
+    pub learning_rate: f32,
+}
+
+/// The environment, if it is one that can be trained in.
+fn checked(environment: Box<dyn Environment>, index: usize) -> Result<Box<dyn Environment>> {
+    let modules = environment.modules();
+    if !(1..=composer_shared::robot::MAX_MODULES).contains(&modules) {
+        bail!("environment {index} has {modules} modules; there must be 1 to {}", composer_shared::robot::MAX_MODULES);
     }
-    norm
+    Ok(environment)
+}
+
+/// What is logged of the episodes that ended in an iteration.
+fn episode_scalars(episodes: &[&Outcome]) -> Vec<(String, f64)> {
+    let mean =
+        |f: &dyn Fn(&Outcome) -> f64| episodes.iter().map(|outcome| f(outcome)).sum::<f64>() / episodes.len() as f64;
+    vec![
+        ("charts/episodic_return".into(), mean(&|o| f64::from(o.episode_return))),
+        ("charts/episodic_length".into(), mean(&|o| f64::from(o.steps))),
+        ("charts/success_rate".into(), mean(&|o| f64::from(u8::from(o.success)))),
+        ("charts/final_distance".into(), mean(&|o| f64::from(o.distance))),
+        ("charts/episodes".into(), episodes.len() as f64),
+    ]
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn orthogonal_matrices_are() {
-        let mut rng = stream(1, Stream::Weights, 0, 0);
-        for (rows, columns) in [(5, 12), (12, 5), (7, 7)] {
-            let m = orthogonal(rows, columns, 2.0, &mut rng);
-            let at = |r: usize, c: usize| m[r * columns + c];
-            let short = rows.min(columns);
-            for i in 0..short {
-                for j in 0..short {
-                    let dot: f32 = if rows <= columns {
-                        (0..columns).map(|c| at(i, c) * at(j, c)).sum()
-                    } else {
-                        (0..rows).map(|r| at(r, i) * at(r, j)).sum()
-                    };
-                    assert!((dot - if i == j { 4.0 } else { 0.0 }).abs() < 1e-5, "{rows}x{columns} {i} {j}: {dot}");
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn streams_differ_in_every_part() {
-        let seeds = [
-            derive_seed(1, Stream::Noise, 0, 0),
-            derive_seed(2, Stream::Noise, 0, 0),
-            derive_seed(1, Stream::Shuffle, 0, 0),
-            derive_seed(1, Stream::Noise, 1, 0),
-            derive_seed(1, Stream::Noise, 0, 1),
-        ];
-        for (i, a) in seeds.iter().enumerate() {
-            assert!(!seeds[..i].contains(a));
-        }
-    }
-
-    #[test]
-    fn normal_numbers_have_mean_zero_and_variance_one() {
-        let mut rng = stream(3, Stream::Noise, 0, 0);
-        let samples: Vec<f64> = (0..20_000).flat_map(|_| normal_pair(&mut rng)).map(f64::from).collect();
-        let mean = samples.iter().sum::<f64>() / samples.len() as f64;
-        let variance = samples.iter().map(|x| x * x).sum::<f64>() / samples.len() as f64;
-        assert!(mean.abs() < 0.02 && (variance - 1.0).abs() < 0.03, "{mean} {variance}");
-    }
-
-    #[test]
-    fn adam_makes_first_steps_of_the_learning_rate_and_finds_a_minimum() {
-        let mut x = vec![3.0f32, -2.0];
-        let mut adam = Adam::new(2, 1e-8);
-        adam.step(&mut x, &[10.0, -0.001], 0.1);
-        assert!((x[0] - 2.9).abs() < 1e-5 && (x[1] + 1.9).abs() < 1e-4, "{x:?}");
-        for _ in 0..500 {
-            let gradient: Vec<f32> = x.iter().map(|x| 2.0 * (x - 1.0)).collect();
-            adam.step(&mut x, &gradient, 0.05);
-        }
-        assert!(x.iter().all(|x| (x - 1.0).abs() < 1e-2), "{x:?}");
-    }
-
-    #[test]
-    fn the_norm_is_clipped_over_everything() {
-        let mut g = vec![3.0, 4.0];
-        assert_eq!(clip_norm(&mut g, 10.0), 5.0);
-        assert_eq!(g, [3.0, 4.0]);
-        clip_norm(&mut g, 1.0);
-        assert!((g[0] - 0.6).abs() < 1e-6 && (g[1] - 0.8).abs() < 1e-6);
-    }
 
     #[test]
     fn methods_have_names() {

@@ -76,55 +76,105 @@ impl Running {
     }
 }
 
-/// Running mean and standard deviation of the returns, so that the critic learns numbers of size 1 (PopArt, van Hasselt et al. 2016).
-///
-/// Old iterations fade: returns grow while the policy gets better.
+/// Normalised numbers are clipped to this.
+pub const CLIP: f32 = 5.0;
+
+/// Mean and one over the standard deviation of some numbers, frozen for an iteration.
+#[derive(Clone, Copy, Debug)]
+pub struct Frozen<const N: usize> {
+    mean: [f32; N],
+    scale: [f32; N],
+}
+
+impl<const N: usize> Frozen<N> {
+    /// The statistics as they are now.
+    pub fn new(running: &Running) -> Self {
+        Self { mean: running.mean(), scale: running.std::<N>().map(f32::recip) }
+    }
+
+    /// Appends the numbers, normalised and clipped.
+    pub fn apply(&self, x: &[f32; N], out: &mut Vec<f32>) {
+        out.extend((0..N).map(|i| ((x[i] - self.mean[i]) * self.scale[i]).clamp(-CLIP, CLIP)));
+    }
+}
+
+/// How the statistics of the returns forget.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Forgetting {
+    /// Old iterations fade, because returns grow while the policy gets better. For PopArt, which keeps what the critic says.
+    #[default]
+    Iterations,
+    /// Nearly an average over all minibatches so far, debiased (ValueNorm of on-policy, HARL and MAT).
+    Minibatches,
+    /// Returns are taken as they are.
+    Off,
+}
+
+/// Running mean and standard deviation of the returns, so that the critic learns numbers of size 1.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ValueNorm {
+    /// How it forgets.
+    pub forgetting: Forgetting,
     mean: f64,
     square: f64,
     weight: f64,
 }
 
 impl ValueNorm {
-    /// What is left of an iteration's weight when the next one comes in.
-    const DECAY: f64 = 0.95;
-
-    /// Takes in the returns of an iteration.
-    pub fn update(&mut self, returns: &[f32]) {
-        if returns.is_empty() {
-            return;
-        }
-        let n = returns.len() as f64;
-        let mean = returns.iter().map(|r| f64::from(*r)).sum::<f64>() / n;
-        let square = returns.iter().map(|r| f64::from(*r).powi(2)).sum::<f64>() / n;
-        self.mean = Self::DECAY * self.mean + (1.0 - Self::DECAY) * mean;
-        self.square = Self::DECAY * self.square + (1.0 - Self::DECAY) * square;
-        self.weight = Self::DECAY * self.weight + (1.0 - Self::DECAY);
+    /// Nothing seen.
+    pub fn new(forgetting: Forgetting) -> Self {
+        Self { forgetting, ..Self::default() }
     }
 
-    /// All numbers it is made of; [`ValueNorm::from_numbers`] takes them back.
+    /// What is left of the weight of what was seen when more comes in.
+    fn decay(&self) -> f64 {
+        match self.forgetting {
+            Forgetting::Iterations => 0.95,
+            Forgetting::Minibatches | Forgetting::Off => 0.99999,
+        }
+    }
+
+    /// Takes in the returns of an iteration or a minibatch.
+    pub fn update(&mut self, returns: &[f32]) {
+        if returns.is_empty() || self.forgetting == Forgetting::Off {
+            return;
+        }
+        let (n, decay) = (returns.len() as f64, self.decay());
+        let mean = returns.iter().map(|r| f64::from(*r)).sum::<f64>() / n;
+        let square = returns.iter().map(|r| f64::from(*r).powi(2)).sum::<f64>() / n;
+        self.mean = decay * self.mean + (1.0 - decay) * mean;
+        self.square = decay * self.square + (1.0 - decay) * square;
+        self.weight = decay * self.weight + (1.0 - decay);
+    }
+
+    /// All numbers it is made of; [`ValueNorm::restore`] takes them back.
     pub fn numbers(&self) -> [f64; 3] {
         [self.mean, self.square, self.weight]
     }
 
-    /// Takes three numbers off the front of a list.
-    pub fn from_numbers(numbers: &mut impl Iterator<Item = f64>) -> Option<Self> {
-        Some(Self { mean: numbers.next()?, square: numbers.next()?, weight: numbers.next()? })
+    /// Goes back to what it was.
+    pub fn restore(&mut self, [mean, square, weight]: [f64; 3]) {
+        *self = Self { mean, square, weight, ..*self };
     }
 
     /// Mean of the returns; 0 before any were seen.
     pub fn mean(&self) -> f32 {
-        if self.weight == 0.0 { 0.0 } else { (self.mean / self.weight) as f32 }
+        if self.weight == 0.0 { 0.0 } else { (self.mean / self.weight.max(1e-5)) as f32 }
     }
 
-    /// Standard deviation of the returns, at least 0.01; 1 before any were seen.
+    /// Standard deviation of the returns, at least 0.01, or 0.1 where minibatches are averaged; before any were seen 1, or 0.1 there.
     pub fn std(&self) -> f32 {
+        let floor = match self.forgetting {
+            Forgetting::Iterations => STD_FLOOR,
+            Forgetting::Minibatches => 0.1,
+            Forgetting::Off => return 1.0,
+        };
         if self.weight == 0.0 {
-            return 1.0;
+            return if self.forgetting == Forgetting::Minibatches { 0.1 } else { 1.0 };
         }
-        let mean = self.mean / self.weight;
-        (self.square / self.weight - mean * mean).max(STD_FLOOR * STD_FLOOR).sqrt() as f32
+        let weight = self.weight.max(1e-5);
+        let mean = self.mean / weight;
+        (self.square / weight - mean * mean).max(floor * floor).sqrt() as f32
     }
 
     /// From the critic's scale to the reward's.

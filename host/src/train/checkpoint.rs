@@ -1,6 +1,6 @@
 //! The checkpoint: one file with all that a run needs to go on bit for bit.
 //!
-//! Layout, little-endian: magic `CMPSRCK3`, then the fields of [`Checkpoint`] in order (lists and texts after
+//! Layout, little-endian: magic `CMPSRCK3`, then the fields of [`Checkpoint`] and of its state in order (lists and texts after
 //! their length as u64), then the CRC-32 of everything before.
 //! A new one is written beside the old one, made durable and renamed, so that there is a whole one at every moment.
 
@@ -11,7 +11,8 @@ use std::path::Path;
 use thiserror::Error;
 
 use crate::files;
-use crate::methods::actor_critic::OUT;
+use crate::methods::on_policy::collect::ACTIONS;
+use crate::methods::{EpisodeState, LearnerState, State};
 
 /// File name of the checkpoint in the folder of a run.
 pub const FILE: &str = "checkpoint.bin";
@@ -48,28 +49,6 @@ pub enum CheckpointError {
     Write(String, io::Error),
 }
 
-/// A running episode of one environment: replaying its actions after the reset leads back to where it was.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Episode {
-    /// Its number, which gives its seed.
-    pub number: u64,
-    /// Actions since the reset.
-    pub actions: Vec<[f32; OUT]>,
-}
-
-/// One policy and its critic.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct LearnerState {
-    /// Steps taken by the actor's and the critic's optimiser.
-    pub adam_steps: [u64; 2],
-    /// Parameters, then both moments of Adam: of the actor, then of the critic.
-    pub parameters: [Vec<f32>; 6],
-    /// Statistics of the returns.
-    pub value_norm: [f64; 3],
-    /// Learning rate of the next update, if it is adapted.
-    pub learning_rate: f32,
-}
-
 /// The state of a run between two iterations.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Checkpoint {
@@ -77,14 +56,8 @@ pub struct Checkpoint {
     pub config: String,
     /// What the run trains for: robot and task, in the caller's words.
     pub fingerprint: String,
-    /// Iterations done.
-    pub iteration: u64,
-    /// The control policy, then the imagination policy if the method has one.
-    pub learners: Vec<LearnerState>,
-    /// Statistics: whatever numbers the normalisers of the observations are made of.
-    pub statistics: Vec<f64>,
-    /// One entry per environment.
-    pub episodes: Vec<Episode>,
+    /// What the method has learnt and where its episodes are.
+    pub state: State,
 }
 
 impl Checkpoint {
@@ -95,9 +68,9 @@ impl Checkpoint {
             number(&mut out, text.len() as u64);
             out.extend_from_slice(text.as_bytes());
         }
-        number(&mut out, self.iteration);
-        number(&mut out, self.learners.len() as u64);
-        for learner in &self.learners {
+        number(&mut out, self.state.iteration);
+        number(&mut out, self.state.learners.len() as u64);
+        for learner in &self.state.learners {
             learner.adam_steps.iter().for_each(|steps| number(&mut out, *steps));
             for parameters in &learner.parameters {
                 number(&mut out, parameters.len() as u64);
@@ -106,10 +79,10 @@ impl Checkpoint {
             learner.value_norm.iter().for_each(|n| out.extend_from_slice(&n.to_le_bytes()));
             out.extend_from_slice(&learner.learning_rate.to_le_bytes());
         }
-        number(&mut out, self.statistics.len() as u64);
-        self.statistics.iter().for_each(|s| out.extend_from_slice(&s.to_le_bytes()));
-        number(&mut out, self.episodes.len() as u64);
-        for episode in &self.episodes {
+        number(&mut out, self.state.statistics.len() as u64);
+        self.state.statistics.iter().for_each(|s| out.extend_from_slice(&s.to_le_bytes()));
+        number(&mut out, self.state.episodes.len() as u64);
+        for episode in &self.state.episodes {
             number(&mut out, episode.number);
             number(&mut out, episode.actions.len() as u64);
             episode.actions.as_flattened().iter().for_each(|a| out.extend_from_slice(&a.to_le_bytes()));
@@ -121,8 +94,8 @@ impl Checkpoint {
     /// None if a length does not fit: with a right checksum that happens only to a file of another program.
     fn decode(body: &[u8]) -> Option<Self> {
         let mut reader = Reader(body);
-        let mut checkpoint = Self { config: reader.text()?, fingerprint: reader.text()?, ..Self::default() };
-        checkpoint.iteration = reader.number()?;
+        let (config, fingerprint) = (reader.text()?, reader.text()?);
+        let mut state = State { iteration: reader.number()?, ..State::default() };
         for _ in 0..reader.length(16)? {
             let mut learner = LearnerState { adam_steps: [reader.number()?, reader.number()?], ..Default::default() };
             for parameters in &mut learner.parameters {
@@ -132,17 +105,18 @@ impl Checkpoint {
                 *number = f64::from_bits(reader.number()?);
             }
             learner.learning_rate = reader.float()?;
-            checkpoint.learners.push(learner);
+            state.learners.push(learner);
         }
         let count = reader.length(8)?;
-        checkpoint.statistics = (0..count).map(|_| reader.number().map(f64::from_bits)).collect::<Option<_>>()?;
+        state.statistics = (0..count).map(|_| reader.number().map(f64::from_bits)).collect::<Option<_>>()?;
         let count = reader.length(16)?;
         for _ in 0..count {
             let number = reader.number()?;
-            let actions = reader.floats(OUT)?.chunks_exact(OUT).map(|pair| std::array::from_fn(|i| pair[i])).collect();
-            checkpoint.episodes.push(Episode { number, actions });
+            let actions =
+                reader.floats(ACTIONS)?.chunks_exact(ACTIONS).map(|pair| std::array::from_fn(|i| pair[i])).collect();
+            state.episodes.push(EpisodeState { number, actions });
         }
-        reader.0.is_empty().then_some(checkpoint)
+        reader.0.is_empty().then_some(Self { config, fingerprint, state })
     }
 
     /// Reads the checkpoint of a run.
@@ -225,20 +199,22 @@ mod tests {
         Checkpoint {
             config: "seed = 1".into(),
             fingerprint: "snake".into(),
-            iteration: 3,
-            learners: [7, 9]
-                .map(|n| LearnerState {
-                    adam_steps: [n, n + 1],
-                    parameters: std::array::from_fn(|i| vec![0.1 * i as f32, f32::MIN_POSITIVE, -(n as f32)]),
-                    value_norm: [0.1 * n as f64, -0.0, f64::MAX],
-                    learning_rate: 1e-3 * n as f32,
-                })
-                .into(),
-            statistics: vec![1.0 / 3.0, f64::EPSILON],
-            episodes: vec![
-                Episode { number: 5, actions: vec![[0.1, -7.5], [1e-30, 2.0]] },
-                Episode { number: 0, actions: vec![] },
-            ],
+            state: State {
+                iteration: 3,
+                learners: [7, 9]
+                    .map(|n| LearnerState {
+                        adam_steps: [n, n + 1],
+                        parameters: std::array::from_fn(|i| vec![0.1 * i as f32, f32::MIN_POSITIVE, -(n as f32)]),
+                        value_norm: [0.1 * n as f64, -0.0, f64::MAX],
+                        learning_rate: 1e-3 * n as f32,
+                    })
+                    .into(),
+                statistics: vec![1.0 / 3.0, f64::EPSILON],
+                episodes: vec![
+                    EpisodeState { number: 5, actions: vec![[0.1, -7.5], [1e-30, 2.0]] },
+                    EpisodeState { number: 0, actions: vec![] },
+                ],
+            },
         }
     }
 

@@ -5,47 +5,12 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
+use crate::methods::Times;
+
 /// How often a plain line is printed.
 const EVERY: Duration = Duration::from_secs(10);
 /// The same for one of several runs.
 const EVERY_OF_SEVERAL: Duration = Duration::from_secs(30);
-
-/// Where the time of some iterations went, wall time on all cores but for the two parts of the rollout.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Times {
-    /// Environment steps.
-    pub steps: u64,
-    /// Wall time.
-    pub wall: Duration,
-    /// Wall time of the rollouts, the part spent in the environments.
-    pub physics: Duration,
-    /// Wall time of the rollouts, the part spent in the policy and in book-keeping.
-    pub inference: Duration,
-    /// Wall time of the updates.
-    pub update: Duration,
-}
-
-impl Times {
-    /// Adds another span of time.
-    pub fn add(&mut self, other: &Times) {
-        self.steps += other.steps;
-        self.wall += other.wall;
-        self.physics += other.physics;
-        self.inference += other.inference;
-        self.update += other.update;
-    }
-
-    /// Environment steps per second.
-    pub fn steps_per_second(&self) -> f64 {
-        self.steps as f64 / self.wall.as_secs_f64().max(1e-9)
-    }
-
-    /// Shares of physics, inference and update, 0 to 1.
-    pub fn shares(&self) -> [f64; 3] {
-        let total = (self.physics + self.inference + self.update).as_secs_f64().max(1e-9);
-        [self.physics, self.inference, self.update].map(|part| part.as_secs_f64() / total)
-    }
-}
 
 /// Shows how a run is getting on, on standard error.
 #[derive(Debug)]

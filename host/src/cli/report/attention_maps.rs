@@ -9,7 +9,6 @@ use crate::env::SnakeEnv;
 use crate::environment::{Environment, View};
 use crate::eval::{DEFAULT_SEED, episode_seed};
 use crate::files::write_whole;
-use crate::network::Network;
 use crate::plot::{Heatmap, heatmaps};
 use crate::policy::Policy;
 use crate::run::RunConfig;
@@ -20,10 +19,10 @@ const MAPS: usize = 5;
 const TRIED: u64 = 100;
 
 /// Draws the attention matrices of the first successful episode of a policy; without one there is no figure, and a line says so.
-pub fn write(config: &RunConfig, network: &Network, path: &Path) -> Result<()> {
+pub fn write(config: &RunConfig, policy: &dyn Policy, path: &Path) -> Result<()> {
     let env = Arc::new(config.evaluation());
     for index in 0..TRIED {
-        let Some(matrices) = successful(&env, network, episode_seed(DEFAULT_SEED, index))? else { continue };
+        let Some(matrices) = successful(&env, policy, episode_seed(DEFAULT_SEED, index))? else { continue };
         let last = matrices.len() - 1;
         let maps = (0..MAPS).map(|k| {
             let step = k * last / (MAPS - 1);
@@ -41,14 +40,14 @@ pub fn write(config: &RunConfig, network: &Network, path: &Path) -> Result<()> {
 }
 
 /// The attention matrix of every control step of an episode, if it succeeds.
-fn successful(env: &Arc<crate::env::EnvConfig>, network: &Network, seed: u64) -> Result<Option<Vec<Vec<f32>>>> {
+fn successful(env: &Arc<crate::env::EnvConfig>, policy: &dyn Policy, seed: u64) -> Result<Option<Vec<Vec<f32>>>> {
     let mut env = SnakeEnv::new(env.clone());
     env.reset_with(seed, &[]);
     let (mut view, mut actions, mut matrices) = (View::default(), Vec::new(), Vec::new());
     loop {
         let mut attention = Vec::new();
         env.view(&mut view);
-        Policy::act(network, &view, 0, &mut actions, Some(&mut attention));
+        policy.act(&view, 0, &mut actions, Some(&mut attention));
         if attention.is_empty() {
             bail!("the policy has no attention to draw");
         }

@@ -206,9 +206,9 @@ fn compare(what: What, arguments: &Comparison) -> Result<()> {
         for task in [Task::GoalReaching, Task::WallClimbing, Task::TubeCrossing] {
             let complete = |run: &&Run| run.config.task.name == task && run.config.train.method == Method::Composer;
             let Some(run) = runs.iter().find(complete) else { continue };
-            let (config, network) = load_run(&run.folder)?;
+            let (config, policy) = load_run(&run.folder)?;
             let path = out.join(format!("attention-{task}.svg"));
-            attention_maps::write(&config, &network, &path)?;
+            attention_maps::write(&config, &policy, &path)?;
         }
     }
     let seeds = if arguments.so_far { "those".into() } else { arguments.seeds.to_string() };
@@ -270,7 +270,7 @@ fn finish(what: What, run: &Run, episodes: u64, threads: usize) -> Result<()> {
     if result.exists() || !trained(&run.folder, &run.config, threads)? {
         return Ok(());
     }
-    let (config, network) = load_run(&run.folder)?;
+    let (config, policy) = load_run(&run.folder)?;
     let env = Arc::new(config.evaluation());
     let trial = Trial { config: &env, episodes: episodes as usize, seed: PUBLISHED_SEED, faults: &healthy, threads };
     let mut results = serde_json::Map::new();
@@ -278,7 +278,7 @@ fn finish(what: What, run: &Run, episodes: u64, threads: usize) -> Result<()> {
         let plan: composer_sim_bridge::faults::FaultPlan =
             fault.parse().with_context(|| format!("the fault {fault}"))?;
         let draw = |seed, modules| plan.draw(seed, modules);
-        let report = Trial { faults: &draw, ..trial }.evaluate(&network, fault, &|| {});
+        let report = Trial { faults: &draw, ..trial }.evaluate(&policy, fault, &|| {});
         results.insert(fault.into(), serde_json::to_value(report)?);
     }
     write_whole(&result, serde_json::to_string_pretty(&results)?.as_bytes())

@@ -7,12 +7,12 @@ use burn::tensor::activation::softmax;
 use burn::tensor::{Device, Tensor, TensorData};
 use composer_shared::observation::SIZE;
 
-use super::Block;
-use super::actor_critic::{
-    ActorLayout, Batch, CriticLayout, EMBED, Gradient, KEY, LOG_DENSITY_CONSTANT, PpoLoss, VALUE,
-};
+use super::actor::{ActorLayout, EMBED, KEY, LOG_DENSITY_CONSTANT, VALUE};
+use super::critic::CriticLayout;
 use super::fused::bias_tanh;
 use crate::environment::PRIVILEGED;
+use crate::methods::on_policy::{Batch, Gradient, LossSettings};
+use crate::methods::parameters::Block;
 
 /// Added to the score of a module that is not heard.
 const UNHEARD: f32 = -1e9;
@@ -105,7 +105,7 @@ impl ActorLayout {
     }
 
     /// PPO's clipped loss over a batch, and its gradient, by automatic differentiation.
-    pub fn autodiff(&self, parameters: &[f32], batch: &Batch, loss: PpoLoss) -> Gradient {
+    pub fn autodiff(&self, parameters: &[f32], batch: &Batch, loss: LossSettings) -> Gradient {
         let device = Device::flex().autodiff();
         let modules = longest(batch);
         let rows = batch.samples() * modules;
@@ -131,7 +131,8 @@ impl ActorLayout {
         let total = (gain.min_pair(clipped) * weights).sum().neg();
         let log_ratio = floats(log_ratio.inner());
         let gradient = collect(&total, tensors, self.blocks(), self.len);
-        let mut result = Gradient { gradient, loss: f64::from(total.into_scalar::<f32>()), ..Gradient::default() };
+        let mut result =
+            Gradient { gradient, policy_loss: f64::from(total.into_scalar::<f32>()), ..Gradient::default() };
         for (log_ratio, weight) in log_ratio.iter().zip(&row_weights).filter(|(_, weight)| **weight > 0.0) {
             let (log_ratio, weight) = (f64::from(*log_ratio), f64::from(*weight));
             let ratio = log_ratio.exp();
@@ -188,6 +189,6 @@ impl CriticLayout {
         let error = self.forward(&tensors, batch, &device) - targets;
         let loss = (error.clone() * error).sum() * (0.5 * weight);
         let gradient = collect(&loss, tensors, self.blocks(), self.len);
-        Gradient { gradient, loss: f64::from(loss.into_scalar::<f32>()), ..Gradient::default() }
+        Gradient { gradient, value_loss: f64::from(loss.into_scalar::<f32>()), ..Gradient::default() }
     }
 }

@@ -1,10 +1,98 @@
-//! The critic: values of whole teams, and the gradient of their squared error, derived by hand.
+//! The critic: layout of its parameters, values of whole teams, and the gradient of their squared error, derived by hand.
+//!
+//! It sees the whole team: the same two layers for every module, then the mean over the modules beside the head module's embedding, so that
+//! it works for any number of modules.
 
 use composer_shared::observation::SIZE;
 
-use super::actor_critic::{Batch, CriticLayout, EMBED, Gradient, HIDDEN, room, transpose, transpose_back};
-use super::kernels::{Start, bias_tanh_backward, dense, dense_weights, head, head_backward, tanh};
+use super::actor::{EMBED, HIDDEN};
 use crate::environment::PRIVILEGED;
+use crate::methods::kernels::{Start, bias_tanh_backward, dense, dense_weights, head, head_backward, tanh};
+use crate::methods::on_policy::{Batch, Gradient};
+use crate::methods::parameters::{Block, lay_out, orthogonal, room, transpose, transpose_back};
+use crate::methods::random::{Stream, stream};
+
+/// What the critic knows of a module.
+pub const CRITIC_INPUT: usize = SIZE + PRIVILEGED;
+
+/// Where things are in the critic's parameters.
+#[derive(Clone, Copy, Debug)]
+pub struct CriticLayout {
+    /// First layer, over one module.
+    pub first: Block,
+    /// Its bias.
+    pub first_bias: Block,
+    /// Second layer, over one module: the module's embedding.
+    pub second: Block,
+    /// Its bias.
+    pub second_bias: Block,
+    /// Third layer, over the mean embedding and the head's.
+    pub team: Block,
+    /// Its bias.
+    pub team_bias: Block,
+    /// Output.
+    pub value: Block,
+    /// Its bias.
+    pub value_bias: Block,
+    /// Length of the parameter vector.
+    pub len: usize,
+}
+
+impl Default for CriticLayout {
+    fn default() -> Self {
+        let ([first, first_bias, second, second_bias, team, team_bias, value, value_bias], len) = lay_out([
+            ("first.weight", EMBED, CRITIC_INPUT),
+            ("first.bias", 1, EMBED),
+            ("second.weight", EMBED, EMBED),
+            ("second.bias", 1, EMBED),
+            ("team.weight", HIDDEN, 2 * EMBED),
+            ("team.bias", 1, HIDDEN),
+            ("value.weight", 1, HIDDEN),
+            ("value.bias", 1, 1),
+        ]);
+        Self { first, first_bias, second, second_bias, team, team_bias, value, value_bias, len }
+    }
+}
+
+impl CriticLayout {
+    /// All blocks in order.
+    pub fn blocks(&self) -> [Block; 8] {
+        [
+            self.first,
+            self.first_bias,
+            self.second,
+            self.second_bias,
+            self.team,
+            self.team_bias,
+            self.value,
+            self.value_bias,
+        ]
+    }
+
+    /// Initial parameters: orthogonal, gain sqrt 2 (`value_gain` for the output), zero bias.
+    pub fn initial(&self, seed: u64, value_gain: f32) -> Vec<f32> {
+        let mut p = vec![0.0; self.len];
+        let mut rng = stream(seed, Stream::Weights, 1, 0);
+        for (block, gain) in [
+            (self.first, std::f32::consts::SQRT_2),
+            (self.second, std::f32::consts::SQRT_2),
+            (self.team, std::f32::consts::SQRT_2),
+            (self.value, value_gain),
+        ] {
+            p[block.range()].copy_from_slice(&orthogonal(block.rows, block.columns, gain, &mut rng));
+        }
+        p
+    }
+
+    /// Changes the output layer so that its values stay the same on the reward's scale while the scale of the critic moves from
+    /// (`mean`, `std`) to (`new_mean`, `new_std`): the "preserving outputs" half of PopArt.
+    pub fn rescale(&self, parameters: &mut [f32], [mean, std]: [f32; 2], [new_mean, new_std]: [f32; 2]) {
+        let ratio = std / new_std;
+        parameters[self.value.range()].iter_mut().for_each(|w| *w *= ratio);
+        let bias = &mut parameters[self.value_bias.offset];
+        *bias = (std * *bias + mean - new_mean) / new_std;
+    }
+}
 
 /// A critic's weights, ready for both ways.
 #[derive(Clone, Debug)]
@@ -37,7 +125,7 @@ pub struct CriticScratch {
 }
 
 /// The matrices that are kept transposed.
-fn matrices(layout: &CriticLayout) -> [super::Block; 3] {
+fn matrices(layout: &CriticLayout) -> [Block; 3] {
     [layout.first, layout.second, layout.team]
 }
 
@@ -73,8 +161,8 @@ impl Critic {
         let (rows, teams) = (observations.len() / SIZE, modules.len());
         let CriticScratch { values, first, second, pooled, team, .. } = scratch;
         let layout = &self.layout;
-        let bias = |block: super::Block| &self.parameters[block.range()];
-        let matrix = |block: super::Block| &self.transposed[block.range()];
+        let bias = |block: Block| &self.parameters[block.range()];
+        let matrix = |block: Block| &self.transposed[block.range()];
         let (of_observations, of_privileged) = matrix(layout.first).split_at(SIZE * EMBED);
         let first = room(first, rows * EMBED);
         dense(observations, SIZE, of_observations, Start::Bias(bias(layout.first_bias)), first);
@@ -114,12 +202,12 @@ impl Critic {
         let of_values = room(of_values, teams);
         for ((of_value, value), target) in of_values.iter_mut().zip(values.iter()).zip(&batch.targets) {
             let error = value - target;
-            sum.loss += f64::from(0.5 * weight * error * error);
+            sum.value_loss += f64::from(0.5 * weight * error * error);
             *of_value = weight * error;
         }
 
         let gradient = &mut sum.gradient;
-        let weights = |block: super::Block| &self.parameters[block.range()];
+        let weights = |block: Block| &self.parameters[block.range()];
         let (first, second, team) = (&first[..rows * EMBED], &second[..rows * EMBED], &team[..teams * HIDDEN]);
         let of_team = room(of_team, teams * HIDDEN);
         let (of_value_weights, of_bias) = gradient[layout.value.offset..].split_at_mut(layout.value.len());

@@ -12,7 +12,7 @@ use burn::backend::tensor::FloatTensor;
 use burn::backend::{Flex, TensorMetadata};
 use burn::tensor::{DType, Shape, Tensor};
 
-use super::kernels;
+use crate::methods::kernels;
 
 type Primitive = FloatTensor<Flex>;
 

@@ -1,16 +1,158 @@
-//! The actor: its forward pass, the same for rollouts and updates, and the gradient of PPO's clipped loss, derived by hand.
+//! The actor: layout of its parameters, its forward pass, the same for rollouts, updates and evaluation, and the gradient of PPO's clipped
+//! loss, derived by hand.
+//!
+//! It is the network of [`crate::network`]: encoder, optional attention, hidden layer, two outputs a module, and a standard deviation that
+//! does not depend on the state. That of the imagination policy is the same without attention and with three outputs.
 //!
 //! Plain f32 over whole teams, no tensor library, no allocation once the working memory has grown. What a module does depends on its own
 //! team alone, bit for bit: a batch of many teams and a rollout of one agree.
 
 use composer_shared::observation::SIZE;
 
-use super::actor_critic::{
-    ActorLayout, Batch, EMBED, Gradient, HIDDEN, KEY, LOG_DENSITY_CONSTANT, PpoLoss, VALUE, room, transpose,
-    transpose_back,
-};
-use super::kernels::{Start, bias_tanh_backward, dense, dense_weights, dot, head, head_backward, tanh};
-use super::simd::{Vector, vectorise};
+use crate::methods::kernels::{Start, bias_tanh_backward, dense, dense_weights, dot, head, head_backward, tanh};
+use crate::methods::on_policy::{Batch, Gradient, LossSettings};
+use crate::methods::parameters::{Block, lay_out, orthogonal, room, transpose, transpose_back};
+use crate::methods::random::{Stream, stream};
+use crate::methods::simd::{Vector, vectorise};
+use crate::network::{Dense, Network};
+
+/// Size of a module's embedding.
+pub const EMBED: usize = 64;
+/// Size of a latent's key and of a query.
+pub const KEY: usize = 16;
+/// Size of a latent's value.
+pub const VALUE: usize = 32;
+/// Size of the hidden layer.
+pub const HIDDEN: usize = 64;
+/// Where things are in an actor's parameters.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ActorLayout {
+    /// `[EMBED, SIZE]` weights of the encoder.
+    pub encoder: Block,
+    /// Its bias.
+    pub encoder_bias: Block,
+    /// Query, key and value weights, one below the other: `[2 KEY + VALUE, EMBED]`. Empty without attention.
+    pub attention: Block,
+    /// Weights of the hidden layer over the own embedding.
+    pub hidden: Block,
+    /// Weights of the hidden layer over what attention gathered. Empty without attention.
+    pub hidden_context: Block,
+    /// Bias of the hidden layer.
+    pub hidden_bias: Block,
+    /// Weights of the outputs.
+    pub output: Block,
+    /// Bias of the outputs.
+    pub output_bias: Block,
+    /// Logarithm of the standard deviation of each action.
+    pub log_sigma: Block,
+    /// Length of the parameter vector.
+    pub len: usize,
+}
+
+impl ActorLayout {
+    /// The layout of an actor with so many actions a module, with attention or without.
+    pub fn new(attention: bool, outputs: usize) -> Self {
+        let attention = usize::from(attention);
+        let (
+            [encoder, encoder_bias, attention, hidden, hidden_context, hidden_bias, output, output_bias, log_sigma],
+            len,
+        ) = lay_out([
+            ("encoder.weight", EMBED, SIZE),
+            ("encoder.bias", 1, EMBED),
+            ("attention.weight", attention * (2 * KEY + VALUE), EMBED),
+            ("hidden.weight", HIDDEN, EMBED),
+            ("hidden.context_weight", HIDDEN, attention * VALUE),
+            ("hidden.bias", 1, HIDDEN),
+            ("output.weight", outputs, HIDDEN),
+            ("output.bias", 1, outputs),
+            ("log_sigma", 1, outputs),
+        ]);
+        Self {
+            encoder,
+            encoder_bias,
+            attention,
+            hidden,
+            hidden_context,
+            hidden_bias,
+            output,
+            output_bias,
+            log_sigma,
+            len,
+        }
+    }
+
+    /// Actions of a module.
+    pub fn outputs(&self) -> usize {
+        self.output.rows
+    }
+
+    /// All blocks in order.
+    pub fn blocks(&self) -> [Block; 9] {
+        [
+            self.encoder,
+            self.encoder_bias,
+            self.attention,
+            self.hidden,
+            self.hidden_context,
+            self.hidden_bias,
+            self.output,
+            self.output_bias,
+            self.log_sigma,
+        ]
+    }
+
+    /// Initial parameters: orthogonal, gain sqrt 2 (1 for query, key and value, 0.01 for the outputs), zero bias.
+    pub fn initial(&self, seed: u64, sigma: f32) -> Vec<f32> {
+        let mut p = vec![0.0; self.len];
+        let mut rng = stream(seed, Stream::Weights, 0, 0);
+        let root2 = std::f32::consts::SQRT_2;
+        p[self.encoder.range()].copy_from_slice(&orthogonal(EMBED, SIZE, root2, &mut rng));
+        if !self.attention.is_empty() {
+            let parts = [(0, KEY), (KEY, KEY), (2 * KEY, VALUE)];
+            for (start, rows) in parts {
+                let from = self.attention.offset + start * EMBED;
+                p[from..from + rows * EMBED].copy_from_slice(&orthogonal(rows, EMBED, 1.0, &mut rng));
+            }
+        }
+        let context = self.hidden_context.columns;
+        let hidden = orthogonal(HIDDEN, EMBED + context, root2, &mut rng);
+        for (row, weights) in hidden.chunks_exact(EMBED + context).enumerate() {
+            p[self.hidden.offset + row * EMBED..][..EMBED].copy_from_slice(&weights[..EMBED]);
+            p[self.hidden_context.offset + row * context..][..context].copy_from_slice(&weights[EMBED..]);
+        }
+        p[self.output.range()].copy_from_slice(&orthogonal(self.outputs(), HIDDEN, 0.01, &mut rng));
+        p[self.log_sigma.range()].fill(sigma.ln());
+        p
+    }
+
+    /// The network that these parameters of a control policy are, with the statistics of its observations.
+    pub fn network(&self, parameters: &[f32], mean: [f32; SIZE], std: [f32; SIZE]) -> Network {
+        let dense =
+            |weights: Vec<f32>, inputs: usize, outputs: usize, bias: Vec<f32>| Dense { inputs, outputs, weights, bias };
+        let part = |block: Block| parameters[block.range()].to_vec();
+        let attention = !self.attention.is_empty();
+        let qkv = if attention { part(self.attention) } else { vec![0.0; (2 * KEY + VALUE) * EMBED] };
+        let mut hidden = vec![0.0; HIDDEN * (EMBED + VALUE)];
+        for row in 0..HIDDEN {
+            let to = &mut hidden[row * (EMBED + VALUE)..][..EMBED + VALUE];
+            to[..EMBED].copy_from_slice(&parameters[self.hidden.offset + row * EMBED..][..EMBED]);
+            if attention {
+                to[EMBED..].copy_from_slice(&parameters[self.hidden_context.offset + row * VALUE..][..VALUE]);
+            }
+        }
+        Network {
+            attention,
+            mean,
+            std,
+            encoder: dense(part(self.encoder), SIZE, EMBED, part(self.encoder_bias)),
+            query: dense(qkv[..KEY * EMBED].to_vec(), EMBED, KEY, Vec::new()),
+            key: dense(qkv[KEY * EMBED..2 * KEY * EMBED].to_vec(), EMBED, KEY, Vec::new()),
+            value: dense(qkv[2 * KEY * EMBED..].to_vec(), EMBED, VALUE, Vec::new()),
+            hidden: dense(hidden, EMBED + VALUE, HIDDEN, part(self.hidden_bias)),
+            output: dense(part(self.output), HIDDEN, self.outputs(), part(self.output_bias)),
+        }
+    }
+}
 
 /// Query, key and value of one module in a row.
 const LATENT: usize = 2 * KEY + VALUE;
@@ -48,7 +190,7 @@ pub struct ActorScratch {
 }
 
 /// The matrices that are kept transposed. The output layer is too narrow to gain by it.
-fn matrices(layout: &ActorLayout) -> [super::Block; 4] {
+fn matrices(layout: &ActorLayout) -> [Block; 4] {
     [layout.encoder, layout.attention, layout.hidden, layout.hidden_context]
 }
 
@@ -76,6 +218,11 @@ impl Actor {
         &self.parameters[self.layout.log_sigma.range()]
     }
 
+    /// Where things are in the parameters.
+    pub fn layout(&self) -> &ActorLayout {
+        &self.layout
+    }
+
     fn has_attention(&self) -> bool {
         !self.layout.attention.is_empty()
     }
@@ -92,8 +239,8 @@ impl Actor {
         let rows = heard.len();
         let ActorScratch { means, embedding, latent, attention, context, hidden, .. } = scratch;
         let layout = &self.layout;
-        let bias = |block: super::Block| &self.parameters[block.range()];
-        let matrix = |block: super::Block| &self.transposed[block.range()];
+        let bias = |block: Block| &self.parameters[block.range()];
+        let matrix = |block: Block| &self.transposed[block.range()];
         let embedding = room(embedding, rows * EMBED);
         dense(observations, SIZE, matrix(layout.encoder), Start::Bias(bias(layout.encoder_bias)), embedding);
         tanh(embedding);
@@ -114,7 +261,7 @@ impl Actor {
     }
 
     /// Adds PPO's clipped loss over a batch to `sum`, and its gradient, transposed: see [`Actor::finish`].
-    pub fn gradient(&self, batch: &Batch, loss: PpoLoss, scratch: &mut ActorScratch, sum: &mut Gradient) {
+    pub fn gradient(&self, batch: &Batch, loss: LossSettings, scratch: &mut ActorScratch, sum: &mut Gradient) {
         self.means(&batch.observations, &batch.heard, &batch.modules, scratch);
         let (layout, rows) = (&self.layout, batch.rows());
         let ActorScratch {
@@ -134,7 +281,7 @@ impl Actor {
         clipped_loss(batch, &means[..rows * layout.outputs()], self.log_sigma(), loss, of_means, layout, sum);
 
         let gradient = &mut sum.gradient;
-        let weights = |block: super::Block| &self.parameters[block.range()];
+        let weights = |block: Block| &self.parameters[block.range()];
         let (embedding, hidden) = (&embedding[..rows * EMBED], &hidden[..rows * HIDDEN]);
         let of_hidden = room(of_hidden, rows * HIDDEN);
         let (of_output, of_bias) = gradient[layout.output.offset..].split_at_mut(layout.output.len());
@@ -172,7 +319,7 @@ fn clipped_loss(
     batch: &Batch,
     means: &[f32],
     log_sigma: &[f32],
-    loss: PpoLoss,
+    loss: LossSettings,
     of_means: &mut [f32],
     layout: &ActorLayout,
     sum: &mut Gradient,
@@ -200,7 +347,7 @@ fn clipped_loss(
         let exact = f64::from(log_ratio).exp();
         let ratio = exact as f32;
         let (gain, clipped) = (ratio * advantage, ratio.clamp(1.0 - loss.clip, 1.0 + loss.clip) * advantage);
-        sum.loss -= f64::from(gain.min(clipped) * weight);
+        sum.policy_loss -= f64::from(gain.min(clipped) * weight);
         sum.kl += f64::from(*weight) * (exact - 1.0 - f64::from(log_ratio));
         if (exact - 1.0).abs() > f64::from(loss.clip) {
             sum.clipped += f64::from(*weight);
@@ -315,4 +462,17 @@ fn attend_backward_body<V: Vector>(
         }
         (first, at) = (first + n, at + n * n);
     }
+}
+
+/// ln(2 pi) / 2, for each action dimension. Its last digit does not count: it cancels in every ratio.
+pub(crate) const LOG_DENSITY_CONSTANT: f32 = 0.918_938_6;
+
+/// Logarithm of the density of `action` under independent normals of mean `mean` and standard deviation exp(`log_sigma`).
+pub fn log_probability(action: &[f32], mean: &[f32], log_sigma: &[f32]) -> f32 {
+    let mut sum = -(action.len() as f32 * LOG_DENSITY_CONSTANT);
+    for i in 0..action.len() {
+        let distance = (action[i] - mean[i]) * (-log_sigma[i]).exp();
+        sum -= 0.5 * distance * distance + log_sigma[i];
+    }
+    sum
 }

@@ -1,0 +1,253 @@
+//! COMPOSER (Zhang, Niu, Liu, Zhao; section III) and its ablations.
+//!
+//! One policy, shared by all modules: an encoder of what the module observes, self-attention over the latents of the modules it hears, a
+//! hidden layer over both, two torques ([`actor`]). A critic that sees the whole team, in training alone ([`critic`]). An imagination
+//! policy beside it, which the control policy is rewarded for following ([`imagination`](super::imagination)). Trained like MAPPO: the ratio is one a
+//! module, its clip too, the value and so the advantage is the team's.
+//!
+//! Where this is not the paper's:
+//!
+//! - The raw embedding skips the attention, so that a module that hears nobody still acts; the critic is privileged and pools, so that
+//!   it works for any number of modules.
+//! - The value loss is not clipped; values are kept on the returns' scale by PopArt.
+//! - Orthogonal weights, a hundredth of that in the last layer, a small standard deviation at the start, observations normalised by
+//!   statistics that are pooled over the modules; a stop at a limit of the KL divergence.
+//!
+//! The gradients are written by hand ([`actor`], [`critic`]) and checked against burn's ([`autodiff`]).
+
+pub mod actor;
+pub mod autodiff;
+pub mod critic;
+pub mod fused;
+#[cfg(test)]
+mod tests;
+
+use anyhow::Result;
+use composer_shared::observation::SIZE;
+use serde::{Deserialize, Serialize};
+
+use self::actor::{Actor, ActorLayout, ActorScratch, log_probability};
+use self::critic::{Critic, CriticLayout, CriticScratch};
+use super::config::TrainConfig;
+use super::imagination::{DISPLACEMENT, Imagination};
+use super::normalise::{Forgetting, ValueNorm};
+use super::on_policy::collect::ACTIONS;
+use super::on_policy::update::Standardise;
+use super::on_policy::{
+    ActorCritic, Batch, CompanionLearner, Gradient, Learner, LossSettings, OnPolicy, OnPolicySettings, Part, Ratio,
+    Teams, Valued,
+};
+use super::random::{Stream, derive_seed};
+use super::{MakeEnvironment, TrainedPolicy};
+
+/// Which code computes the gradients.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Differentiation {
+    /// The backward passes written by hand for these two networks ([`actor`], [`critic`]).
+    #[default]
+    Manual,
+    /// burn's automatic differentiation ([`autodiff`]): several times slower, the same up to rounding. The reference for the former.
+    Automatic,
+}
+
+/// Actor and critic of the control policy or of the imagination policy.
+#[derive(Clone, Debug)]
+pub struct Networks {
+    /// The actor.
+    pub actor: Actor,
+    /// Its critic.
+    pub critic: Critic,
+    /// Who computes the gradients.
+    pub gradient: Differentiation,
+}
+
+/// Working memory of both.
+#[derive(Clone, Debug, Default)]
+pub struct Scratch {
+    actor: ActorScratch,
+    critic: CriticScratch,
+}
+
+impl Networks {
+    /// Networks of zeros: an actor with so many actions a module, with attention or without.
+    pub fn new(attention: bool, outputs: usize, gradient: Differentiation) -> Self {
+        let layout = ActorLayout::new(attention, outputs);
+        Self {
+            actor: Actor::new(layout, &vec![0.0; layout.len]),
+            critic: Critic::new(&vec![0.0; CriticLayout::default().len]),
+            gradient,
+        }
+    }
+
+    /// A learner with initial weights; `sigma` is the standard deviation of the actions, `value_gain` the gain of the critic's output.
+    pub fn learner(self, seed: u64, sigma: f32, value_gain: f32, epsilon: f32, learning_rate: f32) -> Learner<Self> {
+        let actor = self.actor.layout().initial(seed, sigma);
+        let critic = CriticLayout::default().initial(seed, value_gain);
+        Learner::new(self, seed, actor, critic, ValueNorm::new(Forgetting::Iterations), epsilon, learning_rate)
+    }
+}
+
+impl ActorCritic for Networks {
+    type Scratch = Scratch;
+
+    const TOGETHER: usize = 1;
+
+    fn block(&self) -> usize {
+        match self.gradient {
+            // Few enough that what the layers put out stays in the cache of a core.
+            Differentiation::Manual => 16,
+            Differentiation::Automatic => 64,
+        }
+    }
+
+    fn outputs(&self) -> usize {
+        self.actor.layout().outputs()
+    }
+
+    fn ratio(&self) -> Ratio {
+        Ratio::Module
+    }
+
+    fn valued(&self) -> Valued {
+        Valued::Team
+    }
+
+    fn log_sigma(&self) -> Vec<f32> {
+        self.actor.log_sigma().to_vec()
+    }
+
+    fn load(&mut self, part: Part, parameters: &[f32]) {
+        match part {
+            Part::Actor => self.actor.load(parameters),
+            Part::Critic => self.critic.load(parameters),
+        }
+    }
+
+    fn sample(
+        &self,
+        teams: Teams,
+        noise: &[f32],
+        scratch: &mut Scratch,
+        actions: &mut Vec<f32>,
+        log_probabilities: &mut Vec<f32>,
+    ) {
+        let (outputs, log_sigma) = (self.outputs(), self.actor.log_sigma());
+        let means = self.actor.means(teams.observations, teams.heard, teams.modules, &mut scratch.actor);
+        for (mean, noise) in means.chunks_exact(outputs).zip(noise.chunks_exact(outputs)) {
+            let first = actions.len();
+            actions.extend((0..outputs).map(|i| mean[i] + log_sigma[i].exp() * noise[i]));
+            log_probabilities.push(log_probability(&actions[first..], mean, log_sigma));
+        }
+    }
+
+    fn values(&self, teams: Teams, scratch: &mut Scratch, values: &mut Vec<f32>) {
+        let Teams { observations, privileged, modules, .. } = teams;
+        values.extend_from_slice(self.critic.values(observations, privileged, modules, &mut scratch.critic));
+    }
+
+    fn gradient(
+        &self,
+        batch: &Batch,
+        loss: LossSettings,
+        scratch: &mut Scratch,
+        actor: Option<&mut Gradient>,
+        critic: Option<&mut Gradient>,
+    ) {
+        match self.gradient {
+            Differentiation::Manual => {
+                if let Some(sum) = actor {
+                    self.actor.gradient(batch, loss, &mut scratch.actor, sum);
+                }
+                if let Some(sum) = critic {
+                    self.critic.gradient(batch, loss.team_weight, &mut scratch.critic, sum);
+                }
+            }
+            Differentiation::Automatic => {
+                if let Some(sum) = actor {
+                    sum.add(&self.actor.layout().autodiff(self.actor.parameters(), batch, loss));
+                }
+                if let Some(sum) = critic {
+                    let layout = CriticLayout::default();
+                    sum.add(&layout.autodiff(self.critic.parameters(), batch, loss.team_weight));
+                }
+            }
+        }
+    }
+
+    fn finish(&self, part: Part, sum: &[f32], loss: LossSettings, to: &mut Vec<f32>) {
+        let ordered = self.gradient == Differentiation::Automatic;
+        match part {
+            Part::Actor => {
+                self.actor.finish(sum, ordered, to);
+                // The entropy of a normal distribution is ln sigma and a constant.
+                to[self.actor.layout().log_sigma.range()].iter_mut().for_each(|g| *g -= loss.entropy);
+            }
+            Part::Critic => self.critic.finish(sum, ordered, to),
+        }
+    }
+
+    fn floor_sigma(&self, parameters: &mut [f32], sigma: f32) {
+        let least = sigma.ln();
+        parameters[self.actor.layout().log_sigma.range()].iter_mut().for_each(|l| *l = l.max(least));
+    }
+
+    fn rescale(&self, critic: &mut [f32], from: [f32; 2], to: [f32; 2]) {
+        CriticLayout::default().rescale(critic, from, to);
+    }
+
+    fn policy(&self, mean: [f32; SIZE], std: [f32; SIZE]) -> TrainedPolicy {
+        TrainedPolicy::Composer(self.actor.layout().network(self.actor.parameters(), mean, std))
+    }
+}
+
+/// COMPOSER or one of its ablations, as the settings say.
+pub fn new(config: &TrainConfig, make: MakeEnvironment) -> Result<OnPolicy<Networks>> {
+    let settings = config.composer_settings();
+    let (epsilon, rate) = (config.adam_epsilon as f32, config.learning_rate as f32);
+    let networks = Networks::new(config.method.attention(), ACTIONS, config.gradient);
+    let control = networks.learner(config.seed, config.sigma as f32, 1.0, epsilon, rate);
+    let companion = config.method.imagination().then(|| {
+        let seed = derive_seed(config.seed, Stream::Imagination, 0, 0);
+        let imagination = &config.imagination;
+        // Without attention: it never leaves the training, where nobody has to talk. What is imagined earns a tenth of a unit: a critic that
+        // starts with numbers of size 1 would take long to get there.
+        let networks = Networks::new(false, DISPLACEMENT, config.gradient);
+        CompanionLearner {
+            learner: networks.learner(seed, imagination.sigma as f32, 0.01, epsilon, rate),
+            rules: Box::new(Imagination { bound: imagination.bound as f32, follow: imagination.follow as f32 }),
+            settings: OnPolicySettings {
+                gamma: imagination.gamma as f32,
+                epochs: imagination.epochs,
+                critic_epochs: imagination.epochs,
+                ..settings
+            },
+        }
+    });
+    OnPolicy::new(config, settings, control, companion, make)
+}
+
+impl TrainConfig {
+    /// Rollout and update of the control policy. The imagination policy's differ in discount and epochs.
+    pub fn composer_settings(&self) -> OnPolicySettings {
+        OnPolicySettings {
+            environments: self.environments,
+            rollout_steps: self.rollout_steps,
+            minibatches: self.minibatches,
+            epochs: self.epochs,
+            critic_epochs: self.critic_epochs,
+            gamma: self.gamma as f32,
+            lambda: self.lambda as f32,
+            clip: self.clip as f32,
+            kl_stop: self.kl_stop as f32,
+            entropy: self.entropy as f32,
+            actor_grad_norm: self.actor_grad_norm as f32,
+            critic_grad_norm: self.critic_grad_norm as f32,
+            learning_rate: self.learning_rate,
+            learning_rate_end: self.learning_rate_end,
+            kl_target: self.kl_target as f32,
+            sigma_min: self.sigma_min as f32,
+            standardise: Standardise::Rollout(1e-8),
+        }
+    }
+}

@@ -1,0 +1,486 @@
+//! The networks of COMPOSER in rollouts and updates: gradients against slopes and against automatic differentiation, ratios, threads.
+
+use rand::RngExt;
+
+use super::*;
+use crate::environment::{Drift, Environment, PRIVILEGED, Told, Trivial, View};
+use crate::methods::Method;
+use crate::methods::imagination::displacement;
+use crate::methods::normalise::{Frozen, Running};
+use crate::methods::on_policy::buffer::gather;
+use crate::methods::on_policy::update::{adapted, all_samples};
+use crate::methods::on_policy::{
+    Decisions, Iteration, RolloutBuffer, RolloutWorker, Trajectory, Workspace, collect, update,
+};
+use crate::methods::parameters::Block;
+use crate::methods::random::stream;
+use crate::methods::workers::Workers;
+use crate::methods::{Algorithm, config::TrainConfig, imagination::ImaginationConfig};
+use crate::network::Network;
+
+type Learner = super::Learner<Networks>;
+
+/// Learners with policies that are not the initial ones, and a rollout of theirs with teams of different sizes, one of which has a
+/// dead module.
+struct Rollout {
+    control: Learner,
+    imagination: Learner,
+    buffer: RolloutBuffer,
+}
+
+fn rollout(method: Method) -> Rollout {
+    let networks = |attention, outputs| Networks::new(attention, outputs, Differentiation::Manual);
+    let mut control = networks(method.attention(), ACTIONS).learner(5, 0.45, 1.0, 1e-5, 1e-3);
+    let mut imagination = networks(false, DISPLACEMENT).learner(6, 0.45, 1.0, 1e-5, 1e-3);
+    let mut rng = stream(9, Stream::Weights, 7, 7);
+    for learner in [&mut control, &mut imagination] {
+        learner.actor.iter_mut().chain(&mut learner.critic).for_each(|p| *p += 0.3 * (rng.random::<f32>() - 0.5));
+        learner.networks.load(Part::Actor, &learner.actor);
+        learner.networks.load(Part::Critic, &learner.critic);
+    }
+    let teams: [Box<dyn Environment>; 3] = [
+        Box::new(Trivial::new(4, Told::Head)),
+        Box::new(Trivial::new(3, Told::All)),
+        Box::new(Trivial::new(5, Told::Head).with_dead(2)),
+    ];
+    let mut workers: Vec<_> = teams.into_iter().enumerate().map(|(i, team)| RolloutWorker::new(team, i, 5)).collect();
+    let mut buffer = RolloutBuffer::new(3);
+    let (mut observations, mut privileged) = (Running::new(SIZE), Running::new(PRIVILEGED));
+    let rules = Imagination { bound: 0.5, follow: 0.25 };
+    let iteration = Iteration {
+        policy: &control.networks,
+        companion: Some((&imagination.networks, imagination.seed, &rules)),
+        observations: Frozen::new(&observations),
+        privileged: Frozen::new(&privileged),
+        run_seed: 5,
+        iteration: 0,
+        steps: 16,
+    };
+    collect(&mut workers, &mut buffer, &iteration, &Workers::new(2).unwrap(), &mut observations, &mut privileged);
+    Rollout { control, imagination, buffer }
+}
+
+const LOSS: LossSettings = LossSettings { clip: 0.2, entropy: 0.0, team_weight: 1.0 };
+
+const SETTINGS: OnPolicySettings = OnPolicySettings {
+    environments: 3,
+    rollout_steps: 16,
+    learning_rate: 1e-3,
+    learning_rate_end: 1.0,
+    standardise: Standardise::Rollout(1e-8),
+    minibatches: 2,
+    epochs: 2,
+    critic_epochs: 2,
+    gamma: 0.9,
+    lambda: 0.9,
+    clip: 0.2,
+    kl_stop: 1.0,
+    entropy: 0.0,
+    actor_grad_norm: 0.5,
+    critic_grad_norm: 1.0,
+    kl_target: 0.0,
+    sigma_min: 0.0,
+};
+
+fn batch_of(
+    trajectories: &[Trajectory],
+    decisions: &[Decisions],
+    samples: &[(u32, u32)],
+    weight: f32,
+    target: impl Fn(f32) -> f32,
+) -> Batch {
+    let mut batch = Batch::default();
+    gather((trajectories, decisions), samples, Valued::Team, weight, target, &mut batch);
+    batch
+}
+
+fn means(layout: ActorLayout, parameters: &[f32], batch: &Batch) -> Vec<f32> {
+    let mut scratch = ActorScratch::default();
+    Actor::new(layout, parameters).means(&batch.observations, &batch.heard, &batch.modules, &mut scratch).to_vec()
+}
+
+fn critic_values(parameters: &[f32], batch: &Batch) -> Vec<f32> {
+    let mut scratch = CriticScratch::default();
+    Critic::new(parameters).values(&batch.observations, &batch.privileged, &batch.modules, &mut scratch).to_vec()
+}
+
+fn actor_gradient(layout: ActorLayout, parameters: &[f32], batch: &Batch) -> Gradient {
+    let (mut sum, mut ordered) = (Gradient::default(), Vec::new());
+    sum.clear(layout.len);
+    let actor = Actor::new(layout, parameters);
+    actor.gradient(batch, LOSS, &mut ActorScratch::default(), &mut sum);
+    actor.finish(&sum.gradient, false, &mut ordered);
+    Gradient { gradient: ordered, ..sum }
+}
+
+fn critic_gradient(parameters: &[f32], batch: &Batch, weight: f32) -> Gradient {
+    let (mut sum, mut ordered) = (Gradient::default(), Vec::new());
+    sum.clear(parameters.len());
+    let critic = Critic::new(parameters);
+    critic.gradient(batch, weight, &mut CriticScratch::default(), &mut sum);
+    critic.finish(&sum.gradient, false, &mut ordered);
+    Gradient { gradient: ordered, ..sum }
+}
+
+fn ratio_is_one(name: &str, learner: &Learner, trajectories: &[Trajectory], decisions: &[Decisions]) {
+    let batch = batch_of(trajectories, decisions, &all_samples(trajectories), 1.0, |r| r);
+    let layout = *learner.networks.actor.layout();
+    let means = means(layout, &learner.actor, &batch);
+    let log_sigma = &learner.actor[layout.log_sigma.range()];
+    let mut checked = 0;
+    for (row, weight) in batch.weights.iter().enumerate() {
+        if *weight > 0.0 {
+            let outputs = layout.outputs();
+            let vector = |v: &[f32]| -> Vec<f32> { v[row * outputs..(row + 1) * outputs].to_vec() };
+            let new = log_probability(&vector(&batch.actions), &vector(&means), log_sigma);
+            let ratio = (new - batch.log_probabilities[row]).exp();
+            assert!((ratio - 1.0).abs() < 1e-4, "{name} row {row}: {ratio}");
+            checked += 1;
+        }
+    }
+    assert_eq!(checked, 16 * (4 + 3 + 4));
+    // The same seen from the loss: no divergence, nothing clipped.
+    let first = actor_gradient(layout, &learner.actor, &batch);
+    assert!(first.kl.abs() < 1e-6 && first.clipped == 0.0, "{first:?}");
+}
+
+#[test]
+fn ratio_is_one_on_the_first_minibatch_with_masks_and_padding() {
+    for method in Method::ALL {
+        let Rollout { control, imagination, buffer } = rollout(method);
+        ratio_is_one(method.name(), &control, &buffer.trajectories, &buffer.control);
+        ratio_is_one("imagination", &imagination, &buffer.trajectories, &buffer.companion);
+    }
+}
+
+#[test]
+fn the_control_policy_pays_for_not_following() {
+    let RolloutBuffer { trajectories, control, companion } = rollout(Method::Composer).buffer;
+    for ((trajectory, control), imagination) in trajectories.iter().zip(&control).zip(&companion) {
+        assert_eq!((trajectory.companion_errors.len(), imagination.rewards.len()), (16, 16));
+        for (step, error) in trajectory.companion_errors.iter().enumerate() {
+            // Modules of this team never move: the error is how long the displacement was, on average over those that act.
+            let at = step * trajectory.modules..(step + 1) * trajectory.modules;
+            let acting = || {
+                imagination.actions.as_chunks::<DISPLACEMENT>().0[at.clone()]
+                    .iter()
+                    .zip(&trajectory.acts[at.clone()])
+                    .filter(|(_, acts)| **acts)
+            };
+            let lengths = acting().map(|(u, _)| 0.5 * u.iter().map(|x| x * x).sum::<f32>().sqrt().min(1.0));
+            let expected = lengths.sum::<f32>() / acting().count() as f32;
+            assert!((error - expected).abs() < 1e-5, "{error} {expected}");
+            assert_eq!(control.rewards[step], trajectory.rewards[step] - 0.25 * error);
+        }
+    }
+}
+
+#[test]
+fn attention_needs_the_masks_of_the_rollout() {
+    let Rollout { control: learner, buffer: RolloutBuffer { trajectories, control: decisions, .. }, .. } =
+        rollout(Method::ComposerNoImagination);
+    let mut batch = batch_of(&trajectories, &decisions, &all_samples(&trajectories), 1.0, |r| r);
+    let layout = *learner.networks.actor.layout();
+    let right = means(layout, &learner.actor, &batch);
+    // A team acts the same alone as among others, bit for bit ...
+    let alone = batch_of(&trajectories[1..2], &decisions[1..2], &[(0, 3)], 1.0, |r| r);
+    let at = ACTIONS * (16 * 4 + 3 * 3);
+    assert_eq!(means(layout, &learner.actor, &alone), right[at..at + ACTIONS * 3]);
+    // ... but who hears whom must.
+    batch.heard.iter_mut().for_each(|heard| *heard = 0b11111);
+    let wrong = means(layout, &learner.actor, &batch);
+    assert!(right.iter().zip(&wrong).any(|(a, b)| (a - b).abs() > 1e-3));
+}
+
+/// A batch whose ratios lie on both sides of the clip, with advantages of both signs.
+fn shaken(trajectories: &[Trajectory], decisions: &mut [Decisions]) -> Batch {
+    let mut rng = stream(3, Stream::Shuffle, 0, 0);
+    for (trajectory, decision) in trajectories.iter().zip(&mut *decisions) {
+        decision.advantages = (0..trajectory.steps()).map(|_| rng.random_range(-1.0..1.0)).collect();
+        decision.returns = (0..trajectory.steps()).map(|_| rng.random_range(-1.0..1.0)).collect();
+        // Ratios of 0.67, 0.9, 1.1 and 1.5: none so near the edges of the clip that a small step crosses one.
+        let offsets = [-0.4, -0.1, 0.1, 0.4];
+        decision.log_probabilities.iter_mut().for_each(|l| *l += offsets[rng.random_range(0..4)]);
+    }
+    batch_of(trajectories, decisions, &all_samples(trajectories), 1.0 / 176.0, |r| 0.5 * r)
+}
+
+/// Compares a gradient with central differences of the loss, along each of some single parameters and along the gradient.
+fn against_differences(parameters: &[f32], gradient: &[f32], loss: impl Fn(&[f32]) -> f64, blocks: &[Block]) {
+    let slope = |direction: &dyn Fn(usize) -> f32, h: f32| {
+        let moved = |sign: f32| -> Vec<f32> {
+            parameters.iter().enumerate().map(|(i, p)| p + sign * h * direction(i)).collect()
+        };
+        (loss(&moved(1.0)) - loss(&moved(-1.0))) / (2.0 * f64::from(h))
+    };
+    for block in blocks.iter().filter(|block| !block.is_empty()) {
+        // Along the gradient of this block: the slope is its norm.
+        let norm = gradient[block.range()].iter().map(|g| f64::from(*g).powi(2)).sum::<f64>().sqrt();
+        assert!(norm > 1e-5, "{} has no gradient", block.name);
+        let inside = |i: usize| if block.range().contains(&i) { gradient[i] / norm as f32 } else { 0.0 };
+        let along = slope(&inside, 4e-3);
+        assert!((along - norm).abs() < 0.03 * norm + 2e-4, "{}: norm {norm}, slope {along}", block.name);
+        // And at its largest single parameter.
+        let largest = block.range().max_by(|a, b| gradient[*a].abs().total_cmp(&gradient[*b].abs())).unwrap();
+        let single = slope(&|i| if i == largest { 1.0 } else { 0.0 }, 1e-2);
+        let expected = f64::from(gradient[largest]);
+        assert!((single - expected).abs() < 0.05 * expected.abs() + 2e-4, "{}: {expected}, slope {single}", block.name);
+    }
+}
+
+fn clipped_loss(learner: &Learner, batch: &Batch) {
+    let layout = *learner.networks.actor.layout();
+    // The loss again, in double precision and from its formula.
+    let loss = |parameters: &[f32]| -> f64 {
+        let means = means(layout, parameters, batch);
+        let log_sigma = &parameters[layout.log_sigma.range()];
+        let mut sum = 0.0;
+        let advantages = batch.advantages.iter().zip(&batch.modules);
+        let mut advantages = advantages.flat_map(|(advantage, n)| std::iter::repeat_n(f64::from(*advantage), *n));
+        for row in 0..batch.weights.len() {
+            let outputs = layout.outputs();
+            let vector = |v: &[f32]| -> Vec<f32> { v[row * outputs..(row + 1) * outputs].to_vec() };
+            let new = log_probability(&vector(&batch.actions), &vector(&means), log_sigma);
+            let ratio = f64::from(new - batch.log_probabilities[row]).exp();
+            let advantage = advantages.next().unwrap();
+            let gain = (ratio * advantage).min(ratio.clamp(0.8, 1.2) * advantage);
+            sum -= gain * f64::from(batch.weights[row]);
+        }
+        sum
+    };
+    let result = actor_gradient(layout, &learner.actor, batch);
+    assert!((result.policy_loss - loss(&learner.actor)).abs() < 1e-5);
+    assert!(result.clipped > 0.1 && result.clipped < 0.9, "{}", result.clipped);
+    against_differences(&learner.actor, &result.gradient, loss, &layout.blocks());
+}
+
+#[test]
+fn the_gradient_of_the_clipped_loss_is_its_slope() {
+    // With attention and without.
+    for method in [Method::Composer, Method::Mappo] {
+        let Rollout {
+            control,
+            imagination,
+            buffer: RolloutBuffer { trajectories, control: mut of_control, companion: mut of_imagination },
+        } = rollout(method);
+        clipped_loss(&control, &shaken(&trajectories, &mut of_control));
+        clipped_loss(&imagination, &shaken(&trajectories, &mut of_imagination));
+    }
+}
+
+/// Some critic, and a batch.
+fn critic() -> (Vec<f32>, Batch) {
+    let Rollout { control, buffer: RolloutBuffer { trajectories, control: mut decisions, .. }, .. } =
+        rollout(Method::Mappo);
+    (control.critic, shaken(&trajectories, &mut decisions))
+}
+
+#[test]
+fn the_gradient_of_the_value_loss_is_its_slope() {
+    let (critic, batch) = critic();
+    let layout = CriticLayout::default();
+    let loss = |parameters: &[f32]| -> f64 {
+        let values = critic_values(parameters, &batch);
+        values.iter().zip(&batch.targets).map(|(v, t)| 0.25 * f64::from(v - t).powi(2)).sum()
+    };
+    let result = critic_gradient(&critic, &batch, 0.5);
+    assert!((result.value_loss - loss(&critic)).abs() < 1e-4);
+    against_differences(&critic, &result.gradient, loss, &layout.blocks());
+}
+
+/// Largest difference between two gradients of the same loss by the largest number of the block it is in.
+fn same(name: &str, manual: &Gradient, automatic: &Gradient, blocks: &[Block]) {
+    assert!(
+        [(manual.policy_loss, automatic.policy_loss), (manual.value_loss, automatic.value_loss)]
+            .iter()
+            .all(|(m, a)| (m - a).abs() < 1e-5 * a.abs().max(0.1)),
+        "{name}"
+    );
+    assert!((manual.kl - automatic.kl).abs() < 1e-5 && (manual.clipped - automatic.clipped).abs() < 1e-6, "{name}");
+    for block in blocks.iter().filter(|block| !block.is_empty()) {
+        let (manual, automatic) = (&manual.gradient[block.range()], &automatic.gradient[block.range()]);
+        let size = automatic.iter().fold(0.0f32, |size, g| size.max(g.abs()));
+        let apart = manual.iter().zip(automatic).fold(0.0f32, |apart, (m, a)| apart.max((m - a).abs()));
+        assert!(size > 0.0 && apart < 1e-4 * size, "{name} {}: {apart} of {size}", block.name);
+    }
+}
+
+#[test]
+fn gradients_by_hand_are_those_of_automatic_differentiation() {
+    for method in Method::ALL {
+        let Rollout {
+            control,
+            imagination,
+            buffer: RolloutBuffer { trajectories, control: mut of_control, companion: mut of_imagination },
+        } = rollout(method);
+        let batches = [
+            (&control, shaken(&trajectories, &mut of_control)),
+            (&imagination, shaken(&trajectories, &mut of_imagination)),
+        ];
+        for (learner, batch) in batches {
+            let layout = *learner.networks.actor.layout();
+            let automatic = layout.autodiff(&learner.actor, &batch, LOSS);
+            let manual = actor_gradient(layout, &learner.actor, &batch);
+            same(method.name(), &manual, &automatic, &layout.blocks());
+            let layout = CriticLayout::default();
+            let automatic = layout.autodiff(&learner.critic, &batch, 0.01);
+            let manual = critic_gradient(&learner.critic, &batch, 0.01);
+            same("critic", &manual, &automatic, &layout.blocks());
+        }
+    }
+}
+
+#[test]
+fn both_ways_to_the_gradient_learn_the_same() {
+    let [manual, automatic] = [Differentiation::Manual, Differentiation::Automatic].map(|gradient| {
+        let Rollout { mut control, mut buffer, .. } = rollout(Method::Composer);
+        control.networks.gradient = gradient;
+        let mut workspace = Workspace::new(2).unwrap();
+        let (trajectories, decisions) = (&buffer.trajectories, &mut buffer.control);
+        update(&mut control, trajectories, decisions, &SETTINGS, 1e-3, 0, &mut workspace);
+        control
+    });
+    let apart = |a: &[f32], b: &[f32]| a.iter().zip(b).fold(0.0f32, |apart, (a, b)| apart.max((a - b).abs()));
+    assert!(apart(&manual.actor, &automatic.actor) < 2e-4);
+    assert!(apart(&manual.critic, &automatic.critic) < 2e-4);
+}
+
+#[test]
+fn the_learning_rate_follows_the_divergence() {
+    for (kl, expected) in [(0.021, 1e-3 / 1.5), (0.019, 1e-3), (0.006, 1e-3), (0.004, 1.5e-3)] {
+        assert_eq!(adapted(1e-3, kl, 0.01), expected);
+    }
+    assert_eq!([adapted(1e-5, 1.0, 0.01), adapted(1e-2, 0.0, 0.01), adapted(1.0, 1.0, 0.0)], [1e-5, 1e-2, 1.0]);
+    let Rollout { mut control, mut buffer, .. } = rollout(Method::Mappo);
+    let settings = OnPolicySettings { kl_target: 1.0, kl_stop: 10.0, ..SETTINGS };
+    let mut workspace = Workspace::new(1).unwrap();
+    update(&mut control, &buffer.trajectories, &mut buffer.control, &settings, 1e-3, 0, &mut workspace);
+    assert_eq!(control.learning_rate, 1.5e-3);
+}
+
+#[test]
+fn sigma_stays_above_its_least() {
+    let Rollout { mut control, mut buffer, .. } = rollout(Method::Mappo);
+    let settings = OnPolicySettings { sigma_min: 0.6, ..SETTINGS };
+    let mut workspace = Workspace::new(1).unwrap();
+    update(&mut control, &buffer.trajectories, &mut buffer.control, &settings, 1e-3, 0, &mut workspace);
+    let log_sigma = &control.actor[control.networks.actor.layout().log_sigma.range()];
+    assert!(log_sigma.iter().all(|l| *l >= 0.6f32.ln()), "{log_sigma:?}");
+}
+
+#[test]
+fn rescaling_the_critic_keeps_its_values() {
+    let (mut critic, batch) = critic();
+    let layout = CriticLayout::default();
+    let before = critic_values(&critic, &batch);
+    layout.rescale(&mut critic, [1.0, 2.0], [-3.0, 5.0]);
+    let after = critic_values(&critic, &batch);
+    for (before, after) in before.iter().zip(&after) {
+        assert!((before * 2.0 + 1.0 - (after * 5.0 - 3.0)).abs() < 1e-4);
+    }
+}
+
+#[test]
+fn an_update_does_not_depend_on_the_threads() {
+    let results = [1, 2, 3].map(|threads| {
+        let Rollout { mut control, mut imagination, mut buffer } = rollout(Method::Composer);
+        let RolloutBuffer { trajectories, control: of_control, companion: of_imagination } = &mut buffer;
+        let mut workspace = Workspace::new(threads).unwrap();
+        let stats = [
+            update(&mut control, trajectories, of_control, &SETTINGS, 1e-3, 0, &mut workspace),
+            update(&mut imagination, trajectories, of_imagination, &SETTINGS, 1e-3, 0, &mut workspace),
+        ];
+        (control.state(), imagination.state(), stats)
+    });
+    assert_eq!(results[0], results[1]);
+    assert_eq!(results[0], results[2]);
+    for stats in results[0].2 {
+        assert_eq!(stats.actor_minibatches, 4);
+        assert!(stats.first_kl.abs() < 1e-6, "{stats:?}");
+    }
+}
+
+#[test]
+fn the_actor_stops_at_the_kl_limit() {
+    let Rollout { control: mut learner, mut buffer, .. } = rollout(Method::Mappo);
+    let settings = OnPolicySettings { kl_stop: 1e-4, epochs: 10, ..SETTINGS };
+    let mut workspace = Workspace::new(1).unwrap();
+    let (trajectories, decisions) = (&buffer.trajectories, &mut buffer.control);
+    let stats = update(&mut learner, trajectories, decisions, &settings, 1e-2, 0, &mut workspace);
+    assert!(stats.actor_minibatches < 20 && stats.approx_kl > 1e-4, "{stats:?}");
+    assert_eq!(learner.critic_adam.steps, 4);
+    assert_eq!(learner.actor_adam.steps, stats.actor_minibatches as u64);
+}
+
+fn network_of(trainer: &OnPolicy<Networks>) -> Network {
+    trainer.policy().network().unwrap().clone()
+}
+
+fn trained(method: Method, total_steps: u64, make: MakeEnvironment) -> OnPolicy<Networks> {
+    let config = TrainConfig {
+        method,
+        total_steps,
+        environments: 16,
+        rollout_steps: 20,
+        learning_rate: 1e-3,
+        gamma: 0.0,
+        imagination: ImaginationConfig { follow: 1.0, ..Default::default() },
+        ..Default::default()
+    };
+    let mut trainer = new(&config, make).unwrap();
+    while trainer.iteration() * trainer.steps_per_iteration() < total_steps {
+        trainer.iterate().unwrap();
+    }
+    trainer
+}
+
+#[test]
+fn the_imagination_points_at_the_target_and_the_control_policy_follows() {
+    let drift: MakeEnvironment = &|_| Ok(Box::new(Drift::new(3)));
+    let trainer = trained(Method::ComposerNoAttention, 40_000, drift);
+    let network = network_of(&trainer);
+    let imagination = &trainer.companion().unwrap().networks.actor;
+    let bound = ImaginationConfig::default().bound as f32;
+    let mut scratch = ActorScratch::default();
+    let (mut env, mut view) = (Drift::new(3), View::default());
+    let (mut earned, mut possible, mut distance) = (0.0, 0.0, 0.0);
+    for seed in 0..100 {
+        env.reset(seed);
+        for _ in 0..Drift::STEPS {
+            env.view(&mut view);
+            let normalised: Vec<f32> = view
+                .observations
+                .iter()
+                .flat_map(|o| (0..SIZE).map(|i| ((o[i] - network.mean[i]) / network.std[i]).clamp(-5.0, 5.0)))
+                .collect();
+            let means = imagination.means(&normalised, &view.heard, &[3], &mut scratch).as_chunks().0;
+            let imagined: Vec<_> = (0..3).map(|m| env.place(m, displacement(means[m], bound))).collect();
+            earned += env.imagined_reward(&imagined);
+            let best = view.observations.iter().map(|o| o[0].hypot(o[1]).min(bound)).sum::<f32>() / 3.0;
+            possible += best;
+            let mut actions = [[0.0; 2]; 3];
+            network.act(&view.observations, &view.heard, &mut actions, None);
+            let outcome = env.step(&actions);
+            if outcome.truncated {
+                distance += outcome.distance / 100.0;
+            }
+        }
+    }
+    // Nearly the shortest way that there is, and the points arrive, although the task itself pays nothing.
+    assert!(earned > 0.9 * possible, "{earned} of {possible}");
+    assert!(distance < 0.3, "{distance}");
+    // Without imagination nobody tells them where to go.
+    let network = network_of(&trained(Method::Mappo, 10_000, drift));
+    let mut apart = 0.0;
+    for seed in 0..100 {
+        env.reset(seed);
+        for _ in 0..Drift::STEPS {
+            env.view(&mut view);
+            let mut actions = [[0.0; 2]; 3];
+            network.act(&view.observations, &view.heard, &mut actions, None);
+            let outcome = env.step(&actions);
+            apart += if outcome.truncated { outcome.distance / 100.0 } else { 0.0 };
+        }
+    }
+    assert!(apart > 1.5, "{apart}");
+}

@@ -1,0 +1,300 @@
+//! Collecting experience: the environments of a group take each step together, every group on whichever thread is free.
+//!
+//! No group waits for another, and nothing an environment does depends on which thread runs it or when.
+
+use std::time::{Duration, Instant};
+
+use composer_shared::observation::SIZE;
+use rand_chacha::ChaCha8Rng;
+
+use super::buffer::{Decisions, RolloutBuffer, Trajectory};
+use super::{ActorCritic, Teams};
+use crate::environment::{Environment, PRIVILEGED, View};
+use crate::methods::normalise::{Frozen, Running};
+use crate::methods::random::{Stream, derive_seed, normal_noise, stream};
+use crate::methods::workers::Workers;
+use crate::tasks::Point;
+
+/// Actions of a module under a control policy: yaw and pitch torque as a fraction of the limit.
+pub const ACTIONS: usize = 2;
+
+/// An environment, where it is in its sequence of episodes, and how it got there.
+pub struct RolloutWorker {
+    environment: Box<dyn Environment>,
+    index: usize,
+    modules: usize,
+    /// Number of the running episode.
+    pub episode: u64,
+    /// Actions since its reset, all modules of a step together.
+    pub actions: Vec<[f32; ACTIONS]>,
+    view: View,
+    observations: Running,
+    privileged: Running,
+}
+
+impl RolloutWorker {
+    /// Starts the first episode of the environment `index` of a run.
+    pub fn new(environment: Box<dyn Environment>, index: usize, run_seed: u64) -> Self {
+        Self::restore(environment, index, run_seed, 0, Vec::new())
+    }
+
+    /// Brings an environment back to where it was: starts its episode again and replays the actions.
+    pub fn restore(
+        mut environment: Box<dyn Environment>,
+        index: usize,
+        run_seed: u64,
+        episode: u64,
+        actions: Vec<[f32; ACTIONS]>,
+    ) -> Self {
+        environment.reset(episode_seed(run_seed, index, episode));
+        let modules = environment.modules();
+        for step in actions.chunks_exact(modules.max(1)) {
+            environment.step(step);
+        }
+        let mut view = View::default();
+        environment.view(&mut view);
+        Self {
+            environment,
+            index,
+            modules,
+            episode,
+            actions,
+            view,
+            observations: Running::new(SIZE),
+            privileged: Running::new(PRIVILEGED),
+        }
+    }
+
+    /// Modules of the environment.
+    pub fn modules(&self) -> usize {
+        self.modules
+    }
+}
+
+/// Seed of an episode. Independent of everything else that is drawn in the run.
+pub fn episode_seed(run_seed: u64, environment: usize, episode: u64) -> u64 {
+    derive_seed(run_seed, Stream::Episode, environment as u64, episode)
+}
+
+/// A second policy that decides beside the control policy in the same rollouts, and what that means.
+pub trait Companion: Send + Sync {
+    /// What it is called in the metrics.
+    fn name(&self) -> &'static str;
+
+    /// What its error is called there.
+    fn error_name(&self) -> &'static str;
+
+    /// What it earns for `actions` before the step is taken; `plan` gets what they stand for.
+    fn plan(&self, environment: &dyn Environment, acts: &[bool], actions: &[f32], plan: &mut Vec<Point>) -> f32;
+
+    /// By how much the step that was taken missed the plan.
+    fn error(&self, environment: &dyn Environment, acts: &[bool], plan: &[Point]) -> f32;
+
+    /// What is taken off the control policy's reward for an error of 1.
+    fn weight(&self) -> f32;
+}
+
+/// What all environments of an iteration have in common.
+pub struct Iteration<'a, C> {
+    /// The control policy.
+    pub policy: &'a C,
+    /// The policy beside it with the seed of its random streams, if the method has one.
+    pub companion: Option<(&'a C, u64, &'a dyn Companion)>,
+    /// Statistics of the observations.
+    pub observations: Frozen<SIZE>,
+    /// Statistics of the privileged numbers.
+    pub privileged: Frozen<PRIVILEGED>,
+    /// Seed of the run.
+    pub run_seed: u64,
+    /// Number of the iteration.
+    pub iteration: u64,
+    /// Steps each environment takes.
+    pub steps: usize,
+}
+
+/// Processor time of a rollout, summed over the threads.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Split {
+    /// Inside the environments.
+    pub physics: Duration,
+    /// Everything else: the policy, the noise, book-keeping.
+    pub inference: Duration,
+}
+
+/// Runs an iteration: fills `buffer` (as many environments as workers) and takes what was seen into `observations` and `privileged`.
+pub fn collect<C: ActorCritic>(
+    environments: &mut [RolloutWorker],
+    buffer: &mut RolloutBuffer,
+    iteration: &Iteration<C>,
+    workers: &Workers,
+    observations: &mut Running,
+    privileged: &mut Running,
+) -> Split {
+    let mut scratch: Vec<(C::Scratch, Split)> = (0..workers.threads()).map(|_| Default::default()).collect();
+    let RolloutBuffer { trajectories, control, companion } = buffer;
+    let groups = environments.chunks_mut(C::TOGETHER).zip(trajectories.chunks_mut(C::TOGETHER));
+    let decisions = control.chunks_mut(C::TOGETHER).zip(companion.chunks_mut(C::TOGETHER));
+    workers.for_each(groups.zip(decisions), &mut scratch, |((group, to), (control, companion)), (scratch, split)| {
+        let began = Instant::now();
+        let physics = run(group, to, control, companion, iteration, scratch);
+        split.physics += physics;
+        split.inference += began.elapsed().saturating_sub(physics);
+    });
+    // In the order of the environments, so that rounding does not depend on the threads.
+    for environment in environments {
+        observations.merge(&std::mem::replace(&mut environment.observations, Running::new(SIZE)));
+        privileged.merge(&std::mem::replace(&mut environment.privileged, Running::new(PRIVILEGED)));
+    }
+    let mut total = Split::default();
+    for (_, split) in scratch {
+        total.physics += split.physics;
+        total.inference += split.inference;
+    }
+    total
+}
+
+/// What a policy is told of a group, and what it says.
+#[derive(Default)]
+struct Exchange {
+    observations: Vec<f32>,
+    heard: Vec<u64>,
+    modules: Vec<usize>,
+    noise: Vec<f32>,
+    actions: Vec<f32>,
+    log_probabilities: Vec<f32>,
+}
+
+impl Exchange {
+    /// Draws an action for each module of the group and hands every environment's to its decisions.
+    fn decide<C: ActorCritic>(
+        &mut self,
+        policy: &C,
+        rngs: &mut [ChaCha8Rng],
+        scratch: &mut C::Scratch,
+        decisions: &mut [Decisions],
+    ) {
+        let Self { observations, heard, modules, noise, actions, log_probabilities } = self;
+        noise.clear();
+        actions.clear();
+        log_probabilities.clear();
+        for (rng, n) in rngs.iter_mut().zip(&*modules) {
+            normal_noise(rng, *n, policy.outputs(), noise);
+        }
+        let teams = Teams { observations, privileged: &[], heard, modules };
+        policy.sample(teams, noise, scratch, actions, log_probabilities);
+        let (mut actions, mut log_probabilities) = (&actions[..], &log_probabilities[..]);
+        let (of_actions, of_log) = (actions.len() / heard.len(), log_probabilities.len() / heard.len());
+        for (decisions, n) in decisions.iter_mut().zip(modules) {
+            let (own, rest) = actions.split_at(*n * of_actions);
+            decisions.actions.extend_from_slice(own);
+            actions = rest;
+            let (own, rest) = log_probabilities.split_at(*n * of_log);
+            decisions.log_probabilities.extend_from_slice(own);
+            log_probabilities = rest;
+        }
+    }
+}
+
+/// The steps of the environments of one group. Returns the time spent in them.
+fn run<C: ActorCritic>(
+    group: &mut [RolloutWorker],
+    trajectories: &mut [Trajectory],
+    control: &mut [Decisions],
+    companion: &mut [Decisions],
+    iteration: &Iteration<C>,
+    scratch: &mut C::Scratch,
+) -> Duration {
+    let mut physics = Duration::ZERO;
+    let mut exchange = Exchange { modules: group.iter().map(|worker| worker.modules).collect(), ..Default::default() };
+    let noise = |seed, group: &[RolloutWorker]| -> Vec<ChaCha8Rng> {
+        let of = |worker: &RolloutWorker| stream(seed, Stream::Noise, iteration.iteration, worker.index as u64);
+        group.iter().map(of).collect()
+    };
+    let mut rngs = noise(iteration.run_seed, group);
+    let mut companion_rngs = iteration.companion.map_or_else(Vec::new, |(_, seed, _)| noise(seed, group));
+    let mut plans = vec![Vec::new(); group.len()];
+    for (worker, trajectory) in group.iter().zip(&mut *trajectories) {
+        trajectory.clear(worker.modules);
+    }
+    control.iter_mut().chain(&mut *companion).for_each(Decisions::clear);
+    for step in 0..iteration.steps {
+        exchange.observations.clear();
+        exchange.heard.clear();
+        for (worker, trajectory) in group.iter_mut().zip(&mut *trajectories) {
+            let first = trajectory.observations.len();
+            for module in 0..worker.modules {
+                worker.observations.push(&worker.view.observations[module]);
+                worker.privileged.push(&worker.view.privileged[module]);
+                iteration.observations.apply(&worker.view.observations[module], &mut trajectory.observations);
+                iteration.privileged.apply(&worker.view.privileged[module], &mut trajectory.privileged);
+                trajectory.heard.push(worker.view.heard[module] | 1 << module);
+            }
+            trajectory.acts.extend_from_slice(&worker.view.acts);
+            exchange.observations.extend_from_slice(&trajectory.observations[first..]);
+            exchange.heard.extend_from_slice(&trajectory.heard[step * worker.modules..]);
+        }
+        if let Some((policy, _, rules)) = iteration.companion {
+            exchange.decide(policy, &mut companion_rngs, scratch, companion);
+            for (((worker, decisions), trajectory), plan) in
+                group.iter().zip(&mut *companion).zip(&*trajectories).zip(&mut plans)
+            {
+                let n = worker.modules;
+                let actions = &decisions.actions[step * n * policy.outputs()..];
+                let reward = rules.plan(&*worker.environment, &trajectory.acts[step * n..], actions, plan);
+                decisions.rewards.push(reward);
+            }
+        }
+        exchange.decide(iteration.policy, &mut rngs, scratch, control);
+        for (((worker, decisions), trajectory), plan) in
+            group.iter_mut().zip(&mut *control).zip(&mut *trajectories).zip(&plans)
+        {
+            let n = worker.modules;
+            let actions = decisions.actions[step * n * ACTIONS..].as_chunks::<ACTIONS>().0;
+            worker.actions.extend_from_slice(actions);
+
+            let began = Instant::now();
+            let outcome = worker.environment.step(actions);
+            physics += began.elapsed();
+            let mut reward = outcome.reward;
+            if let Some((_, _, rules)) = iteration.companion {
+                let error = rules.error(&*worker.environment, &trajectory.acts[step * n..], plan);
+                trajectory.companion_errors.push(error);
+                reward -= rules.weight() * error;
+            }
+            decisions.rewards.push(reward);
+            trajectory.rewards.push(outcome.reward);
+
+            let began = Instant::now();
+            let truncated = outcome.truncated && !outcome.terminated;
+            let last = step + 1 == iteration.steps;
+            if outcome.terminated || truncated {
+                if truncated {
+                    worker.environment.view(&mut worker.view);
+                    finals(trajectory, &worker.view, iteration);
+                }
+                worker.episode += 1;
+                worker.actions.clear();
+                worker.environment.reset(episode_seed(iteration.run_seed, worker.index, worker.episode));
+                trajectory.episodes.push(outcome);
+            }
+            worker.environment.view(&mut worker.view);
+            physics += began.elapsed();
+
+            trajectory.terminated.push(outcome.terminated);
+            trajectory.truncated.push(truncated);
+            if last && !truncated {
+                finals(trajectory, &worker.view, iteration);
+            }
+        }
+    }
+    physics
+}
+
+/// Appends a final view to a trajectory.
+fn finals<C>(trajectory: &mut Trajectory, view: &View, iteration: &Iteration<C>) {
+    for (module, (observation, privileged)) in view.observations.iter().zip(&view.privileged).enumerate() {
+        iteration.observations.apply(observation, &mut trajectory.final_observations);
+        iteration.privileged.apply(privileged, &mut trajectory.final_privileged);
+        trajectory.final_heard.push(view.heard[module] | 1 << module);
+    }
+}
