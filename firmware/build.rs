@@ -64,7 +64,7 @@ fn sources(folder: &Path, files: &mut Vec<PathBuf>) {
     for entry in fs::read_dir(folder).expect("the sources can be listed") {
         let path = entry.expect("the sources can be listed").path();
         if path.is_dir() {
-            if !path.ends_with("src/bin") {
+            if !path.ends_with("src/bin") && !path.ends_with("tests") {
                 sources(&path, files);
             }
         } else if path.extension().is_some_and(|extension| extension == "rs") && !path.ends_with("tests.rs") {

@@ -52,6 +52,8 @@ use serde::{Deserialize, Serialize};
 use crate::failsafe::Failsafe;
 pub use crate::failsafe::{BusOffPolicy, BusStatus, Fault, FaultSet, LimitedBy};
 use crate::neighbours::{Heard, Neighbours, bit};
+use crate::power::{Power, PowerWatch};
+use crate::safety::Safety;
 
 /// Time in microseconds, or a moment of the module's own clock.
 pub type Micros = u64;
@@ -134,7 +136,7 @@ impl Timing {
 }
 
 /// What makes one module different from the next.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Config {
     /// This module's number: 0 is the head.
     pub node: u8,
@@ -144,15 +146,17 @@ pub struct Config {
     pub bus: BusKind,
     /// What to do after bus-off.
     pub bus_off: BusOffPolicy,
+    /// What it keeps to, whatever its policy wants.
+    pub safety: Safety,
     /// When things happen.
     pub timing: Timing,
 }
 
 impl Config {
-    /// Module `node` of `modules` with the default timing, recovering from bus-off.
+    /// Module `node` of `modules` with the default timing and no limits but the policy's, recovering from bus-off.
     pub fn new(node: u8, modules: u8, bus: BusKind, policy: &Policy<'_>) -> Self {
         let timing = Timing::for_policy(policy, bus, modules);
-        Config { node, modules, bus, bus_off: BusOffPolicy::Recover, timing }
+        Config { node, modules, bus, bus_off: BusOffPolicy::Recover, safety: Safety::POLICY, timing }
     }
 
     /// Whether a controller accepts it; if not, why.
@@ -374,6 +378,7 @@ pub struct Controller<'a> {
     cycle: u16,
     cycle_start: Option<Micros>,
     phase: Phase,
+    power: Power,
     sample: Sensors,
     encoded: Option<Encoded>,
     points: [PointMemory; POINTS],
@@ -410,7 +415,7 @@ impl<'a> Controller<'a> {
             now,
             power_up: now,
             quiet: true,
-            failsafe: Failsafe::new(limits, config.bus_off, timing.poll_grace_us),
+            failsafe: Failsafe::new(limits, config.safety, config.bus_off, timing.poll_grace_us),
             neighbours: Neighbours::new(config.node, config.modules, timing.dead_after, policy.tag()),
             chain: Chain::new(policy.geometry()),
             outbox: Outbox::default(),
@@ -421,6 +426,7 @@ impl<'a> Controller<'a> {
             cycle: 0,
             cycle_start: None,
             phase: Phase::Done,
+            power: Power::default(),
             sample: Sensors::ZERO,
             encoded: None,
             points: policy
@@ -458,16 +464,34 @@ impl<'a> Controller<'a> {
         self.failsafe.check_poll(now);
         self.failsafe.check_bus(bus);
         self.failsafe.check_temperature(sensors.temperature);
+        self.failsafe.check_joints(sensors);
+        self.failsafe.check_power(now, &self.power);
         if let Some(frame) = received {
             self.receive(frame, sensors);
         }
         self.keep_time(sensors);
         self.supervise();
         self.advance();
+        self.bear();
         self.report();
         let deadline = self.deadline();
         self.failsafe.promise(deadline);
         Outputs { torque: self.torque, motors_enabled: self.enabled, deadline }
+    }
+
+    /// Tells what the board measured of supply and motors; it counts from the next poll on, until it is told anew. A board that never does has a good supply.
+    pub fn set_power(&mut self, power: Power) {
+        self.power = power;
+    }
+
+    /// Supply and cut-offs.
+    pub fn power(&self) -> &PowerWatch {
+        self.failsafe.power()
+    }
+
+    /// Which motors that were cut off may begin again: after a poll, for their drivers. Each is said once.
+    pub fn rearm(&mut self) -> [bool; AXES] {
+        self.failsafe.rearm(self.now)
     }
 
     /// The next frame to send, the most urgent first; call it whenever the CAN port has room. A frame that is still waiting in the port
@@ -926,7 +950,7 @@ impl<'a> Controller<'a> {
         let period = self.period();
         let elapsed = self.last_act.map_or(period, |last| self.now.saturating_sub(last));
         let seconds = if elapsed >= period / 4 * 3 { period } else { elapsed } as f32 / 1e6;
-        let (torque, limited_by) = self.failsafe.command(self.torque, action, seconds, &self.sample);
+        let (torque, limited_by) = self.failsafe.command(self.torque, action, seconds);
         self.torque = torque;
         self.limited_by = limited_by;
         self.enabled = !self.failsafe.relaxed();
@@ -935,6 +959,15 @@ impl<'a> Controller<'a> {
         if self.used != 0 {
             self.stats.latent_age_us = u32::try_from(since_start).unwrap_or(u32::MAX);
             self.stats.latent_age_max_us = self.stats.latent_age_max_us.max(self.stats.latent_age_us);
+        }
+    }
+
+    /// Takes back what joints and motors do not bear any more.
+    fn bear(&mut self) {
+        let bearable = self.failsafe.bearable(self.torque);
+        if bearable != self.torque {
+            self.torque = bearable;
+            self.limited_by = LimitedBy::JointAngle;
         }
     }
 

@@ -11,10 +11,14 @@
 //! | 35 duplicate node | yes, and silent | a frame with the module's own number | a restart |
 //! | 36 policy mismatch | no | a neighbour's latent with another policy tag | that neighbour agreeing or silent |
 //! | 37 over-temperature | yes | a motor above the limit, or a reading that is not a number | 5 degrees below the limit |
-//! | 38 joint angle | the axis, outwards | a joint beyond its limit | the joint within its limit |
+//! | 38 joint angle | the axis, outwards | a joint beyond its limit ([`crate::limits`]), at every poll | the joint within its limit |
 //! | 39 sensors | no | readings that cannot be true | readings that can |
 //! | 40 bus-off | if latched | the CAN controller | recovery, or a restart ([`BusOffPolicy`]) |
 //! | 41 isolated | yes | hearing nobody for `isolated_after` periods | the next frame heard |
+//! | 43 undervoltage | yes | the supply below its threshold ([`crate::supply`]) | a supply that has been good for a tenth of a second |
+//! | 44 overvoltage | yes | the supply above its threshold | likewise |
+//! | 45 over-current | the axis | a motor that its driver cut off ([`crate::trips`]) | a rest; after three cut-offs [`Failsafe::clear_cut_offs`], or a restart |
+//! | 46 outside limit | yes | a joint beyond its limit when it was first read | the joint within its limit |
 
 use composer_shared::observation::Sensors;
 use composer_shared::robot::{AXES, Limits};
@@ -22,6 +26,10 @@ pub use composer_shared::wire::{Fault, LimitedBy};
 use serde::{Deserialize, Serialize};
 
 use crate::controller::Micros;
+use crate::limits::Joints;
+use crate::power::{Power, PowerWatch};
+use crate::safety::Safety;
+use crate::supply::Supply;
 
 /// How far below the limit a motor must cool before it is used again, degrees Celsius.
 const COOL_DOWN: f32 = 5.0;
@@ -40,7 +48,10 @@ impl FaultSet {
             | bit(Fault::SyncLost)
             | bit(Fault::DuplicateNode)
             | bit(Fault::OverTemperature)
-            | bit(Fault::Isolated),
+            | bit(Fault::Isolated)
+            | bit(Fault::UnderVoltage)
+            | bit(Fault::OverVoltage)
+            | bit(Fault::OutsideLimit),
     );
 
     /// Whether `fault` is in it.
@@ -102,18 +113,32 @@ pub enum BusOffPolicy {
 /// Keeps the faults and applies the limits.
 #[derive(Clone, Debug)]
 pub struct Failsafe {
+    /// The policy's.
     limits: Limits,
+    /// The module's own.
+    safety: Safety,
     bus_off: BusOffPolicy,
     grace_us: u32,
     faults: FaultSet,
+    joints: Joints,
+    power: PowerWatch,
     /// When the next poll was promised at the latest; none before the first.
     promised: Option<Micros>,
 }
 
 impl Failsafe {
-    /// No faults. A poll may come `grace_us` later than promised.
-    pub fn new(limits: Limits, bus_off: BusOffPolicy, grace_us: u32) -> Self {
-        Failsafe { limits, bus_off, grace_us, faults: FaultSet::EMPTY, promised: None }
+    /// No faults. `limits` are the policy's. A poll may come `grace_us` later than promised.
+    pub fn new(limits: Limits, safety: Safety, bus_off: BusOffPolicy, grace_us: u32) -> Self {
+        Failsafe {
+            joints: Joints::new(safety.joints, limits.joint_angle),
+            power: PowerWatch::new(safety.supply),
+            limits,
+            safety,
+            bus_off,
+            grace_us,
+            faults: FaultSet::EMPTY,
+            promised: None,
+        }
     }
 
     /// All active faults.
@@ -179,51 +204,78 @@ impl Failsafe {
     /// Follows the motor temperature, degrees Celsius.
     pub fn check_temperature(&mut self, temperature: f32) {
         let hot = self.faults.contains(Fault::OverTemperature);
-        let limit = if hot { self.limits.temperature - COOL_DOWN } else { self.limits.temperature };
+        let limit = self.safety.caps.temperature_limit(&self.limits);
+        let limit = if hot { limit - COOL_DOWN } else { limit };
         // A reading that is not a number counts as too hot.
         self.faults.set(Fault::OverTemperature, temperature.is_nan() || temperature > limit);
     }
 
-    /// Follows what the sample of a cycle says of joints and sensors.
+    /// Follows the joints, by the latest readings: at every poll, because within a cycle a joint gets far.
+    pub fn check_joints(&mut self, sensors: &Sensors) {
+        self.joints.follow(sensors);
+        self.faults.set(Fault::JointAngle, self.joints.beyond());
+        self.faults.set(Fault::OutsideLimit, self.joints.started_beyond());
+    }
+
+    /// Follows supply and motors.
+    pub fn check_power(&mut self, now: Micros, power: &Power) {
+        self.power.follow(now, power);
+        self.faults.set(Fault::UnderVoltage, self.power.supply() == Supply::Under);
+        self.faults.set(Fault::OverVoltage, self.power.supply() == Supply::Over);
+        self.faults.set(Fault::OverCurrent, self.power.trips().any());
+    }
+
+    /// Supply and cut-offs.
+    pub fn power(&self) -> &PowerWatch {
+        &self.power
+    }
+
+    /// Which motors that were cut off may begin again now, see [`crate::trips::Trips::rearm`].
+    pub fn rearm(&mut self, now: Micros) -> [bool; AXES] {
+        self.power.rearm(now)
+    }
+
+    /// The station's command to try motors again that were cut off too often.
+    pub fn clear_cut_offs(&mut self) {
+        self.power.clear();
+    }
+
+    /// Follows what the sample of a cycle says of the sensors.
     pub fn check_sample(&mut self, sensors: &Sensors) {
-        let limit = self.limits.joint_angle;
-        self.faults.set(Fault::JointAngle, sensors.joint_angles.iter().any(|a| a.abs() > limit));
         self.faults.set(Fault::Sensors, !sensors.plausible());
     }
 
-    /// The torques to command for the actions (-1 to 1), `seconds` after the `previous` ones, and what held them back. Zero when relaxed.
-    pub fn command(
-        &self,
-        previous: [f32; AXES],
-        action: [f32; AXES],
-        seconds: f32,
-        sensors: &Sensors,
-    ) -> ([f32; AXES], LimitedBy) {
+    /// The torques to command for the actions (-1 to 1), `seconds` after the `previous` ones, and what held them back. Zero when relaxed. What of it
+    /// the joints bear says [`Failsafe::bearable`].
+    pub fn command(&self, previous: [f32; AXES], action: [f32; AXES], seconds: f32) -> ([f32; AXES], LimitedBy) {
         if self.relaxed() {
             return ([0.0; AXES], LimitedBy::Relaxed);
         }
         let mut reason = LimitedBy::Nothing;
         let mut torque = [0.0; AXES];
-        for (axis, ((torque, previous), action)) in torque.iter_mut().zip(previous).zip(action).enumerate() {
-            *torque = self.limits.command(previous, action, seconds);
-            // The command itself stays within the limit even if `previous` was not.
-            *torque = torque.max(-self.limits.torque).min(self.limits.torque);
+        for ((torque, previous), action) in torque.iter_mut().zip(previous).zip(action) {
+            *torque = self.safety.caps.command(&self.limits, previous, action, seconds);
+            let most = self.safety.caps.torque_limit(&self.limits);
             let wanted = action * self.limits.torque;
-            if action.abs() >= 1.0 && reason == LimitedBy::Nothing {
+            if (action.abs() >= 1.0 || wanted.abs() > most) && reason == LimitedBy::Nothing {
                 reason = LimitedBy::Torque;
             }
-            if (wanted - *torque).abs() > 1e-3 * self.limits.torque && action.abs() <= 1.0 {
+            if (wanted.max(-most).min(most) - *torque).abs() > 1e-3 * self.limits.torque && action.abs() <= 1.0 {
                 reason = LimitedBy::Slew;
-            }
-            // Even joints yaw, odd joints pitch.
-            let own_joints = sensors.joint_angles.iter().skip(axis).step_by(AXES);
-            let at_end = |sign: f32| own_joints.clone().any(|angle| sign * angle > self.limits.joint_angle);
-            if (*torque > 0.0 && at_end(1.0)) || (*torque < 0.0 && at_end(-1.0)) {
-                *torque = 0.0;
-                reason = LimitedBy::JointAngle;
             }
         }
         (torque, reason)
+    }
+
+    /// What joints and motors bear of these torques now. At every poll: never more than was commanded, so the next command grows from here.
+    pub fn bearable(&self, torque: [f32; AXES]) -> [f32; AXES] {
+        let mut torque = self.joints.limit(torque);
+        for (axis, torque) in torque.iter_mut().enumerate() {
+            if self.power.trips().off(axis) {
+                *torque = 0.0;
+            }
+        }
+        torque
     }
 }
 
@@ -234,7 +286,7 @@ mod tests {
     fn failsafe() -> Failsafe {
         let limits =
             Limits { torque: 80.0, torque_slew: 800.0, joint_angle: 3.1, temperature: 80.0, ..Limits::default() };
-        Failsafe::new(limits, BusOffPolicy::Recover, 1000)
+        Failsafe::new(limits, Safety::POLICY, BusOffPolicy::Recover, 1000)
     }
 
     fn level() -> Sensors {
@@ -301,20 +353,50 @@ mod tests {
     #[test]
     fn limits_are_applied_and_named() {
         let mut failsafe = failsafe();
-        let command = |f: &Failsafe, previous, action, sensors: &Sensors| f.command(previous, action, 0.05, sensors);
-        assert_eq!(command(&failsafe, [0.0; 2], [0.25, -0.25], &level()), ([20.0, -20.0], LimitedBy::Nothing));
-        assert_eq!(command(&failsafe, [0.0; 2], [0.75, 0.0], &level()), ([40.0, 0.0], LimitedBy::Slew));
-        assert_eq!(command(&failsafe, [70.0, 0.0], [1.0, 0.0], &level()), ([80.0, 0.0], LimitedBy::Torque));
+        let command = |f: &Failsafe, previous, action| f.command(previous, action, 0.05);
+        assert_eq!(command(&failsafe, [0.0; 2], [0.25, -0.25]), ([20.0, -20.0], LimitedBy::Nothing));
+        assert_eq!(command(&failsafe, [0.0; 2], [0.75, 0.0]), ([40.0, 0.0], LimitedBy::Slew));
+        assert_eq!(command(&failsafe, [70.0, 0.0], [1.0, 0.0]), ([80.0, 0.0], LimitedBy::Torque));
+        failsafe.check_joints(&level());
         let bent = Sensors { joint_angles: [0.0, -3.12, 0.0, 0.0], ..level() };
-        assert_eq!(command(&failsafe, [0.0; 2], [0.1, -0.1], &bent), ([8.0, 0.0], LimitedBy::JointAngle));
-        assert_eq!(command(&failsafe, [0.0; 2], [0.1, 0.1], &bent), ([8.0, 8.0], LimitedBy::Nothing));
-        failsafe.check_sample(&bent);
+        failsafe.check_joints(&bent);
+        assert_eq!(failsafe.bearable([8.0, -8.0]), [8.0, 0.0]);
+        assert_eq!(failsafe.bearable([8.0, 8.0]), [8.0, 8.0]);
         assert_eq!(failsafe.faults().number(), 38);
+        assert!(!failsafe.relaxed());
+        failsafe.check_joints(&level());
         failsafe.check_sample(&Sensors::ZERO);
         assert_eq!(failsafe.faults().number(), 39);
         assert!(!failsafe.relaxed());
         failsafe.stop();
-        assert_eq!(command(&failsafe, [70.0; 2], [1.0; 2], &level()), ([0.0; 2], LimitedBy::Relaxed));
+        assert_eq!(command(&failsafe, [70.0; 2], [1.0; 2]), ([0.0; 2], LimitedBy::Relaxed));
         assert_eq!(failsafe.faults().iter().map(|f| f as u8).collect::<std::vec::Vec<_>>(), [32, 39]);
+    }
+
+    #[test]
+    fn a_policy_cannot_raise_the_limits_of_the_module() {
+        let mut failsafe = failsafe();
+        failsafe.safety.caps = crate::limits::Caps { torque: 30.0, torque_slew: 400.0, temperature: 60.0 };
+        assert_eq!(failsafe.command([0.0; 2], [1.0, 0.1], 0.05), ([20.0, 8.0], LimitedBy::Slew));
+        assert_eq!(failsafe.command([20.0, 0.0], [0.5, 0.0], 0.05), ([30.0, 0.0], LimitedBy::Torque));
+        failsafe.check_temperature(61.0);
+        assert_eq!(failsafe.faults().number(), 37);
+    }
+
+    #[test]
+    fn the_supply_and_a_cut_off_motor_are_faults_with_their_effects() {
+        let mut failsafe = failsafe();
+        failsafe.power = PowerWatch::new(crate::supply::Thresholds { under: 9.0, over: 16.0 });
+        let supply = |volts| Some(crate::supply::Extremes::steady(volts));
+        let trips = [None, Some(crate::drivers::motor::Trip::Overcurrent)];
+        failsafe.check_joints(&level());
+        for (volts, number) in [(12.0, 0), (8.0, 43), (17.0, 44)] {
+            failsafe.check_power(0, &Power { supply: supply(volts), trips: [None; AXES] });
+            assert_eq!((failsafe.faults().number(), failsafe.relaxed()), (number, number != 0), "{volts} V");
+        }
+        failsafe.check_power(1_000_000, &Power { supply: supply(12.0), trips });
+        failsafe.check_power(1_100_000, &Power { supply: supply(12.0), trips });
+        assert_eq!((failsafe.faults().number(), failsafe.relaxed()), (45, false));
+        assert_eq!(failsafe.bearable([5.0, 5.0]), [5.0, 0.0], "the other motor goes on");
     }
 }

@@ -26,6 +26,7 @@ pub mod memory_map;
 pub mod neighbours;
 pub mod node_page;
 pub mod port;
+pub mod power;
 pub mod safety;
 pub mod storage;
 pub mod supply;

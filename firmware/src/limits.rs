@@ -6,10 +6,13 @@
 //! # Ends of a joint
 //!
 //! Torque that pushes a joint outwards falls in a straight line over the last [`RAMP`] before the end and is zero from there on. Torque inwards is
-//! always allowed. The angle of a joint beyond its end is worth nothing: an encoder counts a single turn, so a joint pushed to 3.16 rad reads
-//! -3.12. What counts is *through which end* it went ([`JointWatch`]), and that is remembered until it reads an angle between the ends again.
+//! always allowed. An encoder counts a single turn, so a joint pushed to 3.16 rad reads -3.12, and one pushed to 3.3 rad reads -2.98, which could be a good
+//! angle. So the angle is followed from sample to sample by the short way ([`JointWatch`]), and 3.3 rad it is.
 //!
-//! A joint that is beyond an end when it is first read has no such past. Fault 46 then keeps the whole module relaxed until somebody has brought it back.
+//! A joint that is beyond an end when it is first read has no such past, and nobody knows which way leads back. Fault 46 then keeps the whole module
+//! relaxed until somebody has brought it back.
+
+use core::f32::consts::{PI, TAU};
 
 use composer_shared::observation::Sensors;
 use composer_shared::robot::{AXES, Limits, MAX_JOINTS, slew};
@@ -19,7 +22,11 @@ use serde::{Deserialize, Serialize};
 pub const RAMP: f32 = 0.1;
 
 /// Readings beyond this are no angles of a joint, rad: two turns.
-const ABSURD: f32 = 4.0 * core::f32::consts::PI;
+const ABSURD: f32 = 2.0 * TAU;
+/// No joint goes so far beyond its end, rad: a reading that says so is wrong, or those before were.
+const OVERSHOOT: f32 = 1.0;
+/// So many of them in a row, and those before were.
+const ANEW_AFTER: u8 = 100;
 
 /// Where a joint may be, rad.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -32,7 +39,7 @@ pub struct JointRange {
 
 impl JointRange {
     /// All that an encoder of a single turn can say.
-    pub const TURN: JointRange = JointRange { min: -core::f32::consts::PI, max: core::f32::consts::PI };
+    pub const TURN: JointRange = JointRange { min: -PI, max: PI };
 
     /// What lies in this range and within `limit` of straight.
     pub fn within(self, limit: f32) -> Self {
@@ -43,17 +50,16 @@ impl JointRange {
         angle >= self.min && angle <= self.max
     }
 
-    /// Through which end a joint went that was last at `before` and now reads `angle`, by the short way.
-    fn passed(self, before: f32, angle: f32) -> End {
-        let way = angle - before;
-        let way = way - core::f32::consts::TAU * libm::roundf(way / core::f32::consts::TAU);
-        // The way there leads out; where it ends after a gap does not matter.
-        if way >= 0.0 { End::Max } else { End::Min }
+    /// How far an angle lies beyond an end, rad; 0 between them.
+    fn overshoot(self, angle: f32) -> f32 {
+        (angle - self.max).max(self.min - angle).max(0.0)
     }
+}
 
-    fn nearer(self, angle: f32) -> End {
-        if (angle - self.max).abs() <= (angle - self.min).abs() { End::Max } else { End::Min }
-    }
+/// The angle that reads like `reading` and is nearest to `near`, rad.
+fn unwrapped(reading: f32, near: f32) -> f32 {
+    let way = reading - near;
+    near + (way - TAU * libm::roundf(way / TAU))
 }
 
 /// An end of a joint's range.
@@ -65,25 +71,17 @@ pub enum End {
     Max,
 }
 
-/// Where a joint is, as far as it matters for its ends.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-enum Place {
-    /// Never read, or the reading now is no angle.
-    #[default]
-    Unknown,
-    /// Between the ends, at this angle.
-    Between(f32),
-    /// Beyond this end.
-    Beyond(End),
-}
-
 /// Follows one joint from sample to sample.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct JointWatch {
-    /// Now.
-    place: Place,
-    /// At the last reading that was an angle.
-    known: Place,
+    /// Its last known angle, rad, however many turns that is.
+    angle: Option<f32>,
+    /// The last reading was no angle, or none that can be.
+    lost: bool,
+    /// Readings in a row that cannot be.
+    wrong: u8,
+    /// It is beyond an end.
+    beyond: bool,
     /// A true sample was seen.
     started: bool,
     /// It was beyond an end in the first true sample, and has been ever since.
@@ -94,27 +92,29 @@ impl JointWatch {
     /// Takes the next reading (rad) of a joint with this range. `true_sample`: the sample that it belongs to can be believed
     /// ([`Sensors::plausible`]); others are followed, but are no start.
     pub fn follow(&mut self, range: JointRange, reading: f32, true_sample: bool) {
-        if reading.is_nan() || reading.abs() > ABSURD {
-            self.place = Place::Unknown;
+        self.lost = reading.is_nan() || reading.abs() > ABSURD;
+        if self.lost {
             return;
         }
         let starts = true_sample && !self.started;
-        self.place = match self.known {
-            _ if range.contains(reading) => Place::Between(reading),
-            _ if starts => Place::Beyond(range.nearer(reading)),
-            Place::Unknown => Place::Beyond(range.nearer(reading)),
-            Place::Between(before) => Place::Beyond(range.passed(before, reading)),
-            beyond => beyond,
-        };
-        self.known = self.place;
-        let beyond = matches!(self.place, Place::Beyond(_));
-        self.started_beyond = beyond && (starts || self.started_beyond);
+        let anew = unwrapped(reading, (range.min + range.max) / 2.0);
+        let followed = self.angle.filter(|_| !starts).map(|before| unwrapped(reading, before));
+        let wrong = followed.is_some_and(|angle| range.overshoot(angle) > OVERSHOOT);
+        self.wrong = if wrong { self.wrong.saturating_add(1) } else { 0 };
+        if wrong && self.wrong < ANEW_AFTER {
+            self.lost = true;
+            return;
+        }
+        let angle = followed.filter(|_| !wrong).unwrap_or(anew);
+        self.angle = Some(angle);
+        self.beyond = !range.contains(angle);
+        self.started_beyond = self.beyond && (starts || self.started_beyond);
         self.started |= true_sample;
     }
 
     /// Whether the joint is beyond an end.
     pub fn beyond(&self) -> bool {
-        matches!(self.place, Place::Beyond(_))
+        self.beyond
     }
 
     /// Whether it has been there since it was first read.
@@ -124,19 +124,16 @@ impl JointWatch {
 
     /// The part (0 to 1) of a torque of this sign that the joint bears.
     pub fn allows(&self, range: JointRange, outward: End) -> f32 {
-        match self.place {
+        let Some(angle) = self.angle.filter(|_| !self.lost) else {
             // Nobody knows which way is out.
-            Place::Unknown => 0.0,
-            Place::Beyond(end) => f32::from(u8::from(end != outward)),
-            Place::Between(angle) => {
-                let rest = match outward {
-                    End::Min => angle - range.min,
-                    End::Max => range.max - angle,
-                };
-                let ramp = RAMP.min((range.max - range.min) / 4.0);
-                if rest >= ramp { 1.0 } else { (rest / ramp).max(0.0) }
-            }
-        }
+            return 0.0;
+        };
+        let rest = match outward {
+            End::Min => angle - range.min,
+            End::Max => range.max - angle,
+        };
+        let ramp = RAMP.min((range.max - range.min) / 4.0);
+        if rest >= ramp { 1.0 } else { (rest / ramp).max(0.0) }
     }
 }
 
@@ -231,7 +228,6 @@ fn smaller(a: f32, b: f32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use core::f32::consts::{PI, TAU};
     use proptest::prelude::*;
 
     const RANGE: JointRange = JointRange { min: -1.5, max: 3.1 };
@@ -297,6 +293,7 @@ mod tests {
         for (angle, up, down) in
             [(2.9, 1.0, 1.0), (3.05, 0.5, 1.0), (3.09, 0.1, 1.0), (-1.45, 1.0, 0.5), (-1.5, 1.0, 0.0)]
         {
+            joints.follow(&sample(0.5));
             joints.follow(&sample(angle));
             assert!((joints.limit([80.0, 0.0])[0] - 80.0 * up).abs() < 0.02, "{angle}");
             assert!((joints.limit([-80.0, 0.0])[0] + 80.0 * down).abs() < 0.02, "{angle}");
@@ -322,6 +319,18 @@ mod tests {
         assert!(!joints.beyond() && !joints.started_beyond());
         joints.follow(&sample(-1.6));
         assert!(joints.beyond() && !joints.started_beyond(), "it went there later");
+    }
+
+    #[test]
+    fn one_wrong_reading_is_forgotten_with_the_next_right_one() {
+        for wrong in [-3.1, -2.0, -1.0, 0.0, 1.0, 3.1] {
+            let mut joints = Joints::new([JointRange { min: -3.1, max: 3.1 }; MAX_JOINTS], 3.1);
+            for reading in [2.5, 2.6, wrong, 2.6] {
+                joints.follow(&sample(reading));
+            }
+            assert!(!joints.beyond(), "{wrong}");
+            assert_eq!(joints.limit([40.0, -40.0]), [40.0, -40.0], "{wrong}");
+        }
     }
 
     #[test]
@@ -364,21 +373,23 @@ mod tests {
             prop_assert_eq!(Caps::NONE.command(&policy, previous, action, seconds).to_bits(), expected.to_bits());
         }
 
-        /// Whatever way a joint takes, as long as it is no faster than a turn between two samples: no outward torque beyond an end.
+        /// Whatever way a joint takes, as long as it is no faster than half a turn between two samples: no outward torque beyond an end.
         #[test]
-        fn no_outward_torque_beyond_an_end(steps in proptest::collection::vec(-1.0f32..1.0, 1..200)) {
-            let mut joints = joints();
+        fn no_outward_torque_beyond_an_end(min in -3.1f32..-0.5, max in 0.5f32..3.1, steps in proptest::collection::vec(-1.0f32..1.0, 1..200)) {
+            let mut joints = Joints::new([JointRange { min, max }; MAX_JOINTS], 3.1);
             let mut angle: f32 = 0.0;
+            joints.follow(&sample(angle));
             for step in steps {
-                // The mechanics end somewhere beyond the limit, less than a turn from the other end.
-                angle = (angle + step).clamp(-1.5 - 0.7, 3.1 + 0.7);
+                // The mechanics end somewhere beyond the limit.
+                angle = (angle + step).clamp(min - 0.9, max + 0.9);
                 joints.follow(&sample(read(angle)));
                 let [up, _] = joints.limit([80.0, 0.0]);
                 let [down, _] = joints.limit([-80.0, 0.0]);
-                prop_assert!(angle <= RANGE.max || up == 0.0, "{angle}: {up}");
-                prop_assert!(angle >= RANGE.min || down == 0.0, "{angle}: {down}");
-                prop_assert!(angle < RANGE.max || down == -80.0, "inwards from {angle}: {down}");
-                prop_assert!(angle > RANGE.min || up == 80.0, "inwards from {angle}: {up}");
+                // Rounding may move the end by a little.
+                prop_assert!(angle <= max + 1e-5 || up == 0.0, "{angle}: {up}");
+                prop_assert!(angle >= min - 1e-5 || down == 0.0, "{angle}: {down}");
+                prop_assert!(angle < max || down == -80.0, "inwards from {angle}: {down}");
+                prop_assert!(angle > min || up == 80.0, "inwards from {angle}: {up}");
             }
         }
 

@@ -54,7 +54,7 @@ pub enum Fault {
     UnderVoltage = 43,
     /// The supply is too high for the motors.
     OverVoltage = 44,
-    /// A motor was cut off for its current, several times.
+    /// A motor was cut off, for its current or because that cannot be measured. Once too often, and it stays off.
     OverCurrent = 45,
     /// A joint was outside its limits when the module was to be armed.
     OutsideLimit = 46,
@@ -178,7 +178,9 @@ impl Fault {
             Fault::Restarted => (Effect::Disarmed, true, Acknowledgement, "ARM with the acknowledgement"),
             Fault::UnderVoltage => (Effect::Relaxed, false, Itself, "the supply within its limits"),
             Fault::OverVoltage => (Effect::Relaxed, false, Itself, "the supply within its limits"),
-            Fault::OverCurrent => (Effect::Axis, true, Clear, "CLEAR, or a restart"),
+            Fault::OverCurrent => {
+                (Effect::Axis, true, Clear, "a second's rest; the fourth in short order by CLEAR, or a restart")
+            }
             Fault::OutsideLimit => (Effect::Relaxed, true, Itself, "the joint within its limits"),
             Fault::StationLost => (Effect::Disarmed, false, Itself, "the next frame from the station"),
             Fault::ModuleCount => (Effect::On, true, Itself, "the neighbour agreeing, or falling silent"),

@@ -173,7 +173,11 @@ fn make_controller(
     policy: Policy<'static>,
 ) -> Result<&'static mut Controller<'static>, &'static mut ConfigError> {
     static CONTROLLER: StaticCell<Result<Controller<'static>, ConfigError>> = StaticCell::new();
-    let settings = Config { bus_off: page.bus_off, ..Config::new(page.node, page.modules, BusKind::Fd, &policy) };
+    let settings = Config {
+        bus_off: page.bus_off,
+        safety: page.safety,
+        ..Config::new(page.node, page.modules, BusKind::Fd, &policy)
+    };
     CONTROLLER.init_with(|| Controller::new(settings, policy, now())).as_mut()
 }
 
