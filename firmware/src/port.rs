@@ -30,10 +30,10 @@ pub const WAITING: usize = 16;
 /// ([`crate::budget::step_us`]), in which at most 43 frames of the shortest kind go over a bus at 1 and 5 Mbit/s.
 pub const RECEIVED: usize = 64;
 
-/// A CAN port as a module's main loop sees it.
+/// A CAN port as the main loop of a module sees it. It knows what time it is.
 pub trait CanPort {
-    /// Takes a frame to send, at `now`. It never blocks: what has no room any more is the least urgent that waits.
-    fn send(&mut self, now: Micros, frame: &Frame);
+    /// Takes a frame to send. It never blocks: what has no room any more is the least urgent that waits.
+    fn send(&mut self, frame: &Frame);
 
     /// Frames that can wait without displacing others.
     fn room(&self) -> usize;
@@ -41,19 +41,20 @@ pub trait CanPort {
     /// The next received frame.
     fn receive(&mut self) -> Option<Frame>;
 
-    /// Goes on to `now`: what got through makes room, what is out of date is given up.
-    fn poll(&mut self, now: Micros);
+    /// What got through makes room, and what is out of date is given up.
+    fn poll(&mut self);
 
     /// How the CAN controller is, and what happened so far.
     fn status(&self) -> PortStatus;
 
     /// Sends what `next` offers, as long as there is room.
-    fn send_all(&mut self, now: Micros, mut next: impl FnMut() -> Option<Frame>) {
+    fn send_all(&mut self, mut next: impl FnMut() -> Option<Frame>) {
         while self.room() > 0
             && let Some(frame) = next()
         {
-            self.send(now, &frame);
+            self.send(&frame);
         }
+        self.poll();
     }
 }
 

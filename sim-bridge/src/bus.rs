@@ -1,8 +1,8 @@
 //! A CAN or CAN-FD bus in virtual time (ns): arbitration, acknowledgement, fault confinement, topology, disturbances.
 //!
 //! Nodes sit along a line; the cable can be cut between any two of them, and the pieces go on independently. Each node has
-//! [`MAILBOXES`] transmit mailboxes; the lowest identifier in them takes part in arbitration, equal identifiers in order of arrival. What
-//! is not on the wire can be cancelled.
+//! [`MAILBOXES`] transmit mailboxes; the lowest identifier in them takes part in arbitration, equal identifiers in order of arrival. A frame can
+//! be taken back; if it is on the wire it may still get through, but it is not tried again.
 //!
 //! What follows ISO 11898-1:2015:
 //! - frame lengths from the actual bits ([`crate::frame_bits`]), 3 bits of intermission, 8 more (suspend transmission) after a frame for an
@@ -20,11 +20,12 @@
 //! - counters change at the end of the frame or error frame, not in the middle of it;
 //! - plugging and cutting destroys the frames in flight on that piece of cable, if its transmitter was unplugged or the cable changed;
 //! - a frame counts as received at the end of its end-of-frame field (receivers take it one bit earlier);
-//! - a node that goes bus-off loses what was in its mailboxes.
+//! - a node that goes bus-off loses what was in its mailboxes at once.
 
 use std::cmp::Reverse;
 use std::collections::{BinaryHeap, VecDeque};
 
+use composer_firmware::port::{Outcome as MailOutcome, SLOTS};
 use composer_shared::wire::Frame;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -34,9 +35,8 @@ use crate::frame_bits::{self, BitRates, BitStream, INTERFRAME_BITS};
 
 /// Most nodes on a bus.
 pub const MAX_NODES: usize = 128;
-/// Transmit mailboxes of a node. Bosch's M_CAN has up to 32; a driver of a controller with fewer gets the same effect by cancelling a
-/// less urgent frame for a more urgent one.
-pub const MAILBOXES: usize = 16;
+/// Transmit mailboxes of a node, as many as the FDCAN of the board has. What lies in them, [`crate::port`] decides.
+pub const MAILBOXES: usize = SLOTS;
 
 const ERROR_FLAG: u32 = 6;
 const ERROR_DELIMITER: u32 = 8;
@@ -174,6 +174,8 @@ struct Mail {
     ready_ns: u64,
     order: u64,
     duplicated: bool,
+    /// It is on the wire and was asked back.
+    aborted: bool,
 }
 
 #[derive(Clone, Debug, Default)]
@@ -181,6 +183,8 @@ struct Node {
     attached: bool,
     counters: ErrorCounters,
     mailboxes: Vec<Mail>,
+    /// Mail that was taken back, by its order, until somebody asks.
+    returned: Vec<u64>,
     /// The mail on the wire, by its order.
     sending: Option<u64>,
     /// The frame that it floods the bus with, and since when.
@@ -199,6 +203,15 @@ struct Node {
 }
 
 impl Node {
+    /// The mail on the wire did not get through. If it was asked back it is not tried again.
+    fn not_sent(&mut self) {
+        let Some(sending) = self.sending.take() else { return };
+        if let Some(index) = self.mailboxes.iter().position(|mail| mail.order == sending && mail.aborted) {
+            self.mailboxes.swap_remove(index);
+            self.returned.push(sending);
+        }
+    }
+
     /// When it has something to send, if ever.
     fn ready_ns(&self) -> u64 {
         let mails = self.mailboxes.iter().map(|mail| mail.ready_ns);
@@ -389,30 +402,43 @@ impl Bus {
         slot.attached && self.off & bit(node) == 0 && slot.mailboxes.len() < MAILBOXES
     }
 
-    /// How many more frames `node` can take.
-    pub fn room(&self, node: usize) -> usize {
-        if self.has_room(node) { MAILBOXES - self.nodes[node].mailboxes.len() } else { 0 }
-    }
-
-    /// Puts a frame in a mailbox of `node`, to be sent from `ready_ns` on. Gives the frame back if there is no room.
-    pub fn send(&mut self, node: usize, frame: &Frame, ready_ns: u64) -> Result<(), Frame> {
+    /// Puts a frame in a mailbox of `node`, to be sent from `ready_ns` on. Gives the number of this mail, or the frame back if there is no room.
+    pub fn send(&mut self, node: usize, frame: &Frame, ready_ns: u64) -> Result<u64, Frame> {
         if !self.has_room(node) {
             return Err(*frame);
         }
         self.order += 1;
-        let mail = Mail { frame: *frame, ready_ns, order: self.order, duplicated: false };
+        let mail = Mail { frame: *frame, ready_ns, order: self.order, duplicated: false, aborted: false };
         self.nodes[node].mailboxes.push(mail);
         self.pending |= bit(node);
         self.notice(node);
-        Ok(())
+        Ok(self.order)
     }
 
-    /// Takes back the frames of `node` that are not on the wire and for which `which` says so.
-    pub fn cancel(&mut self, node: usize, which: impl Fn(&Frame) -> bool) {
+    /// Takes back the mail of `node` with this number. If it is on the wire it may still get through.
+    pub fn take_back(&mut self, node: usize, number: u64) {
         let slot = &mut self.nodes[node];
-        let sending = slot.sending;
-        slot.mailboxes.retain(|mail| Some(mail.order) == sending || !which(&mail.frame));
-        self.forget_if_empty(node);
+        let Some(index) = slot.mailboxes.iter().position(|mail| mail.order == number) else { return };
+        if slot.sending == Some(number) {
+            slot.mailboxes[index].aborted = true;
+        } else {
+            slot.mailboxes.swap_remove(index);
+            slot.returned.push(number);
+            self.forget_if_empty(node);
+        }
+    }
+
+    /// What became of the mail of `node` with this number. That it came back is told once.
+    pub fn outcome(&mut self, node: usize, number: u64) -> MailOutcome {
+        let slot = &mut self.nodes[node];
+        if let Some(index) = slot.returned.iter().position(|returned| *returned == number) {
+            slot.returned.swap_remove(index);
+            MailOutcome::Returned
+        } else if slot.mailboxes.iter().any(|mail| mail.order == number) {
+            MailOutcome::Pending
+        } else {
+            MailOutcome::Sent
+        }
     }
 
     /// Sets the disturbances of the bus.
@@ -854,10 +880,11 @@ impl Bus {
                 }
                 self.troubled |= (losers | deaf) & present;
                 for node in nodes(losers & present) {
-                    self.nodes[node].sending = None;
+                    self.nodes[node].not_sent();
                     self.nodes[node].counters.transmit_error(false);
                     self.nodes[node].stats.transmit_errors += 1;
                     self.nodes[node].held_ns = since + self.bits_ns(SUSPEND);
+                    self.forget_if_empty(node);
                 }
                 for node in nodes(deaf & present) {
                     self.nodes[node].counters.receive_error(false);
@@ -881,7 +908,7 @@ impl Bus {
                 self.troubled |= joined | transmitters & present;
                 for node in nodes((transmitters | losers) & present) {
                     let slot = &mut self.nodes[node];
-                    slot.sending = None;
+                    slot.not_sent();
                     slot.counters.transmit_error(missing_acknowledgement && losers & bit(node) == 0);
                     slot.stats.transmit_errors += 1;
                 }
@@ -890,6 +917,7 @@ impl Bus {
                     self.nodes[node].stats.receive_errors += 1;
                 }
                 for node in nodes((transmitters | losers) & present) {
+                    self.forget_if_empty(node);
                     if self.state(node) != ErrorState::Active {
                         self.nodes[node].held_ns = since + self.bits_ns(SUSPEND);
                     }
@@ -917,6 +945,7 @@ impl Bus {
         let recovering = self.config.automatic_recovery;
         let slot = &mut self.nodes[node];
         slot.mailboxes.clear();
+        slot.returned.clear();
         slot.sending = None;
         slot.recovering = recovering;
         slot.recessive_sequences = 0;
@@ -936,7 +965,7 @@ impl Bus {
         if let Some(index) = slot.mailboxes.iter().position(|mail| Some(mail.order) == sending) {
             let mail = &mut slot.mailboxes[index];
             self.stats.worst_latency_ns = self.stats.worst_latency_ns.max(now.saturating_sub(mail.ready_ns));
-            if duplicate && !mail.duplicated {
+            if duplicate && !mail.duplicated && !mail.aborted {
                 mail.duplicated = true;
                 self.stats.duplicated += 1;
             } else {

@@ -18,6 +18,7 @@ pub mod frame_bits;
 #[cfg(unix)]
 pub mod live;
 pub mod plant;
+pub mod port;
 pub mod qemu;
 pub mod remote;
 pub mod sensor_model;

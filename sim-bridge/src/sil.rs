@@ -8,7 +8,8 @@
 //! - Sensors are sampled from the plant's state after its last whole step.
 //! - A torque that a controller has computed at time t acts from the first plant step that begins at t or later, never before.
 //! - Computing takes time: [`SilConfig::encode_latency_us`] from the last STATE needed until LATENT is ready to be sent,
-//!   [`SilConfig::act_latency_us`] from the last LATENT needed until the torque is at the motor.
+//!   [`SilConfig::act_latency_us`] from the last LATENT needed until the torque is at the motor. Meanwhile received frames wait.
+//! - Modules and station send and receive through a [`Port`], which is the board's.
 //! - An unplugged module is gone: no controller, no torque from the next plant step on. Plugged in again, a fresh controller starts.
 //!   A module whose computer somebody else takes away is unplugged too, until a fault unplugs it and it is plugged in again.
 //! - With a dead actuator the plant gets no torque, whatever the controller says; with a zeroed sensor the controller reads
@@ -21,9 +22,9 @@
 use std::collections::VecDeque;
 use std::io::{self, Write};
 
-use composer_firmware::controller::{
-    BusKind, BusOffPolicy, BusStatus, Config, ConfigError, FaultSet, Micros, Stats, Timing,
-};
+use composer_firmware::budget::step_us;
+use composer_firmware::controller::{BusKind, BusOffPolicy, Config, ConfigError, FaultSet, Micros, Stats, Timing};
+use composer_firmware::port::{CanPort, Counts};
 use composer_shared::observation::Sensors;
 use composer_shared::policy::{Policy, PolicyError};
 use composer_shared::robot::{AXES, MAX_MODULES};
@@ -36,6 +37,7 @@ use crate::confinement::{ErrorCounters, ErrorState};
 use crate::faults::{Fault, ScheduledFault};
 use crate::frame_bits::BitRates;
 use crate::plant::Plant;
+use crate::port::Port;
 use crate::station::Station;
 
 const NEVER: u64 = u64::MAX;
@@ -138,8 +140,9 @@ pub struct SilConfig {
     /// From the last STATE needed (or the state deadline) until LATENT is ready to be sent, us. The default, 200, is well above what
     /// a Cortex-M4 at 170 MHz needs for the observation and the encoder.
     pub encode_latency_us: u32,
-    /// From the last LATENT needed (or the collection deadline) until the torque is at the motor, us. Default 300.
-    pub act_latency_us: u32,
+    /// From the last LATENT needed (or the collection deadline) until the torque is at the motor, us. None, the default, takes what a whole control
+    /// step of that many modules may take on the Cortex-M4F ([`composer_firmware::budget::step_us`]): 662 for 8 modules, 2441 for 64.
+    pub act_latency_us: Option<u32>,
     /// From hearing SYNC until GOAL is ready to be sent, us. Default 50.
     pub station_latency_us: u32,
     /// Clocks of the modules, head first; those not listed are exact.
@@ -171,7 +174,7 @@ impl SilConfig {
             faults: Vec::new(),
             seed: 0,
             encode_latency_us: 200,
-            act_latency_us: 300,
+            act_latency_us: None,
             station_latency_us: 50,
             clocks: Vec::new(),
             numbers: Vec::new(),
@@ -275,6 +278,8 @@ pub struct ModuleReport {
     pub bus: bus::NodeStats,
     /// Its error counters at the end.
     pub errors: ErrorCounters,
+    /// What happened at its CAN port while it was plugged in last.
+    pub port: Counts,
     /// Longest time between two actions while plugged in, ms. From its start to its first action counts too, and from its
     /// last to the end.
     pub longest_gap_ms: f64,
@@ -335,7 +340,10 @@ struct Module<C> {
     /// Somebody else took the controller away: it does not come back by itself.
     lost: bool,
     clock: Clock,
+    port: Port,
     next_poll_ns: u64,
+    /// It computes until then.
+    busy_until_ns: u64,
     /// What the controller answered last.
     commanded: [f32; AXES],
     /// Torques on their way to the motor, with their times.
@@ -373,15 +381,21 @@ fn add(past: &Stats, now: &Stats) -> Stats {
     }
 }
 
+fn timing_of(config: &SilConfig, policy: &Policy<'_>, modules: usize) -> Timing {
+    config.timing.unwrap_or_else(|| Timing::for_policy(policy, config.bus, modules.max(1) as u8))
+}
+
 struct Engine<'c, L: Launcher> {
     config: &'c SilConfig,
     policy: Policy<'c>,
     launcher: &'c L,
     bus: Bus,
     station: Station,
-    /// GOAL frames of this cycle that wait for a mailbox.
+    /// GOAL frames of this cycle that wait for room in the station's CAN port.
     telling: VecDeque<Frame>,
+    station_port: Port,
     station_node: usize,
+    act_latency_ns: u64,
     modules: Vec<Module<L::Computer>>,
     lost: Vec<Lost>,
     /// What starts (`true`) and ends, in order of time; `next_change` is the first that has not.
@@ -481,6 +495,7 @@ pub fn run_with<P: Plant + ?Sized, L: Launcher>(
         }
         engine.send_scripted(now);
         engine.send_outside(now);
+        engine.poll_ports(now);
         while let Some(event) = engine.bus.poll(now) {
             if let (Some(outside), Event::Delivered { frame, receivers, .. }) = (&mut outside, &event) {
                 let first = engine.outside_node;
@@ -510,6 +525,7 @@ impl<'c, L: Launcher> Engine<'c, L> {
             changes.extend(scheduled.until_ns.map(|until| (until, false, scheduled.fault)));
         }
         changes.sort_by_key(|change| change.0);
+        let period = u64::from(timing_of(config, &policy, count).period_us);
         let mut engine = Engine {
             config,
             policy,
@@ -517,6 +533,7 @@ impl<'c, L: Launcher> Engine<'c, L> {
             bus: Bus::new(bus_config, nodes, config.seed),
             station: Station::new(config.bus == BusKind::Fd, policy.task().points(count as u8)),
             telling: VecDeque::new(),
+            station_port: Port::new(period),
             station_node: config.station_behind.min(count),
             modules: Vec::with_capacity(count),
             lost: Vec::new(),
@@ -528,6 +545,7 @@ impl<'c, L: Launcher> Engine<'c, L> {
             outside_node,
             outside_waiting: VecDeque::new(),
             next_poll_ns: 0,
+            act_latency_ns: 1000 * config.act_latency_us.map_or(step_us(count as u8), u64::from),
         };
         if !config.station {
             engine.bus.unplug(0, engine.station_node);
@@ -537,7 +555,9 @@ impl<'c, L: Launcher> Engine<'c, L> {
                 controller: None,
                 lost: false,
                 clock: config.clock(module),
+                port: Port::new(period),
                 next_poll_ns: 0,
+                busy_until_ns: 0,
                 commanded: [0.0; AXES],
                 coming: VecDeque::new(),
                 motor: [0.0; AXES],
@@ -579,8 +599,7 @@ impl<'c, L: Launcher> Engine<'c, L> {
     }
 
     fn timing(&self) -> Timing {
-        let count = self.modules.len().max(1) as u8;
-        self.config.timing.unwrap_or_else(|| Timing::for_policy(&self.policy, self.config.bus, count))
+        timing_of(self.config, &self.policy, self.modules.len())
     }
 
     /// The node of a module, by its place in the line.
@@ -603,7 +622,8 @@ impl<'c, L: Launcher> Engine<'c, L> {
         let injected =
             self.config.injected.get(self.next_injected).filter(|_| self.bus.has_room(self.modules.len() + 1));
         let injected = injected.map_or(NEVER, |injected| injected.at_ns);
-        change.min(command).min(injected).min(self.next_poll_ns).min(self.bus.next_event_ns())
+        let ports = self.modules.iter().fold(self.station_port.next_ns(), |next, state| next.min(state.port.next_ns()));
+        change.min(command).min(injected).min(self.next_poll_ns).min(ports).min(self.bus.next_event_ns())
     }
 
     /// Starts and ends faults.
@@ -715,12 +735,14 @@ impl<'c, L: Launcher> Engine<'c, L> {
     fn unplug(&mut self, module: usize, now: u64) {
         let node = self.node(module);
         self.bus.unplug(now, node);
+        let period = u64::from(self.timing().period_us);
         let state = &mut self.modules[module];
         if let Some(controller) = state.controller.take() {
             state.past = add(&state.past, &controller.status().stats);
         }
         state.longest_gap_ns = state.longest_gap_ns.max(now.saturating_sub(state.acted_ns));
         state.next_poll_ns = NEVER;
+        state.port = Port::new(period);
         state.commanded = [0.0; AXES];
         state.coming.clear();
         state.coming.push_back((now, [0.0; AXES]));
@@ -733,6 +755,7 @@ impl<'c, L: Launcher> Engine<'c, L> {
         let state = &mut self.modules[module];
         state.controller = Some(controller);
         state.next_poll_ns = now;
+        state.busy_until_ns = now;
         state.acted = 0;
         state.acted_ns = now;
         self.next_poll_ns = self.next_poll_ns.min(now);
@@ -764,7 +787,7 @@ impl<'c, L: Launcher> Engine<'c, L> {
             && at <= now
         {
             self.next_command += 1;
-            let _ = self.bus.send(self.station_node, &self.station.command(command), now);
+            self.station_port.send_at(&self.station.command(command), now);
         }
         let foreign = self.modules.len() + 1;
         while let Some(injected) = self.config.injected.get(self.next_injected)
@@ -790,6 +813,25 @@ impl<'c, L: Launcher> Engine<'c, L> {
         self.outside_waiting.retain(|(node, frame)| !bus.has_room(*node) || bus.send(*node, frame, now).is_err());
     }
 
+    /// Goes on with the ports that have something to do.
+    fn poll_ports(&mut self, now: u64) {
+        for node in 0..self.outside_node {
+            self.poll_port(node, now, false);
+        }
+    }
+
+    /// Goes on with the port of a node, if it is a module's or the station's; without `always` only if it has something to do.
+    fn poll_port(&mut self, node: usize, now: u64, always: bool) {
+        let port = match self.module(node) {
+            Some(module) => &mut self.modules[module].port,
+            None if node == self.station_node => &mut self.station_port,
+            None => return,
+        };
+        if always || port.next_ns() <= now {
+            port.at(&mut self.bus, node, now).poll();
+        }
+    }
+
     fn handle<P: Plant + ?Sized>(
         &mut self,
         plant: &P,
@@ -804,38 +846,59 @@ impl<'c, L: Launcher> Engine<'c, L> {
                     let interface = format!("can{}", self.bus.cuts_before(*segment));
                     candump::write_entry(*out, *at_ns, &interface, frame)?;
                 }
+                let mut asked = 0;
                 for node in bus::nodes(*receivers) {
                     if let Some(module) = self.module(node) {
-                        self.ask(plant, module, *at_ns, Some(frame))?;
+                        self.modules[module].port.hear(frame);
+                        if self.idle(module, *at_ns) {
+                            asked |= 1 << module;
+                            self.ask(plant, module, *at_ns)?;
+                        }
                     }
                 }
                 for node in bus::nodes(*receivers) {
                     if node == self.station_node {
                         self.tell_station(plant, frame, *at_ns);
-                    } else if let Some(module) = self.module(node) {
+                    } else if let Some(module) = self.module(node).filter(|module| asked >> module & 1 == 1) {
                         self.act(module, *at_ns)?;
                     }
                 }
                 if !late {
-                    // A mailbox is free again.
+                    // A slot is free again.
                     for node in bus::nodes(*transmitters) {
                         if node == self.station_node {
                             self.tell(*at_ns);
-                        } else if let Some(module) = self.module(node) {
-                            self.pump(module, *at_ns)?;
                         }
+                        self.poll_port(node, *at_ns, true);
                     }
                 }
             }
             Event::State { at_ns, node, .. } => {
-                if let Some(module) = self.module(*node) {
-                    self.ask(plant, module, *at_ns, None)?;
+                self.poll_port(*node, *at_ns, true);
+                if let Some(module) = self.module(*node)
+                    && self.idle(module, *at_ns)
+                {
+                    self.ask(plant, module, *at_ns)?;
                     self.act(module, *at_ns)?;
                 }
             }
-            Event::ErrorFrame { .. } => {}
+            Event::ErrorFrame { at_ns, transmitters, .. } => {
+                // What was asked back while it was on the wire is here again.
+                bus::nodes(*transmitters).for_each(|node| self.poll_port(node, *at_ns, true));
+            }
         }
         Ok(())
+    }
+
+    /// Whether a module can be polled. If it computes, it is polled when it is done.
+    fn idle(&mut self, module: usize, now: u64) -> bool {
+        let state = &mut self.modules[module];
+        let idle = state.busy_until_ns <= now;
+        if !idle {
+            state.next_poll_ns = state.next_poll_ns.min(state.busy_until_ns);
+            self.next_poll_ns = self.next_poll_ns.min(state.next_poll_ns);
+        }
+        idle
     }
 
     fn tell_station<P: Plant + ?Sized>(&mut self, plant: &P, frame: &Frame, now: u64) {
@@ -843,8 +906,7 @@ impl<'c, L: Launcher> Engine<'c, L> {
             return;
         }
         if let Some(frames) = self.station.receive(frame, |number| plant.point(number)) {
-            // What was still to be told of the last cycle is out of date.
-            self.bus.cancel(self.station_node, |waiting| waiting.function() == Some(Function::Goal));
+            // What was still to be told of the last cycle is out of date; what of it is in the port, a newer GOAL replaces.
             self.telling = frames;
             self.tell(now + u64::from(self.config.station_latency_us) * 1000);
         }
@@ -852,10 +914,10 @@ impl<'c, L: Launcher> Engine<'c, L> {
 
     /// Hands the station's GOAL frames to its CAN port, as many as fit.
     fn tell(&mut self, ready: u64) {
-        while self.bus.has_room(self.station_node)
+        while self.station_port.room() > 0
             && let Some(frame) = self.telling.pop_front()
         {
-            let _ = self.bus.send(self.station_node, &frame, ready);
+            self.station_port.send_at(&frame, ready);
         }
     }
 
@@ -866,7 +928,7 @@ impl<'c, L: Launcher> Engine<'c, L> {
         let due = |module: &Module<L::Computer>| module.next_poll_ns <= now;
         for module in 0..self.modules.len() {
             if due(&self.modules[module]) {
-                self.ask(plant, module, now, None)?;
+                self.ask(plant, module, now)?;
             }
         }
         for module in 0..self.modules.len() {
@@ -878,29 +940,19 @@ impl<'c, L: Launcher> Engine<'c, L> {
         Ok(())
     }
 
-    /// Polls a module. Nothing comes of it before [`Engine::act`], so several can be asked at once.
-    fn ask<P: Plant + ?Sized>(
-        &mut self,
-        plant: &P,
-        module: usize,
-        now: u64,
-        frame: Option<&Frame>,
-    ) -> Result<(), SilError> {
+    /// Polls a module, with the next frame that it received. Nothing comes of it before [`Engine::act`], so several can be asked at once.
+    fn ask<P: Plant + ?Sized>(&mut self, plant: &P, module: usize, now: u64) -> Result<(), SilError> {
         let node = self.node(module);
-        let bus = match self.bus.state(node) {
-            ErrorState::Active => BusStatus::ErrorActive,
-            ErrorState::Passive => BusStatus::ErrorPassive,
-            ErrorState::BusOff => BusStatus::BusOff,
-        };
-        let room = self.bus.room(node);
         let state = &mut self.modules[module];
+        let mut port = state.port.at(&mut self.bus, node, now);
+        let (frame, bus, room) = (port.receive(), port.status().bus, port.room());
         let Some(controller) = &mut state.controller else { return Ok(()) };
         let sensors = match &state.sensors {
             SensorState::Good => &*state.sample.get_or_insert_with(|| plant.sensors(module)),
             SensorState::Zeroed => &Sensors::ZERO,
             SensorState::Stuck(sample) => sample,
         };
-        let poll = Poll { now: state.clock.show(now), sensors, frame, bus, room };
+        let poll = Poll { now: state.clock.show(now), sensors, frame: frame.as_ref(), bus, room };
         match controller.ask_poll(&poll) {
             Ok(()) => Ok(()),
             Err(trouble) => self.lose(module, now, trouble),
@@ -915,45 +967,57 @@ impl<'c, L: Launcher> Engine<'c, L> {
             Ok(answer) => answer,
             Err(trouble) => return self.lose(module, now, trouble),
         };
-        let outputs = answer.outputs;
-        let torque = if outputs.motors_enabled { outputs.torque } else { [0.0; AXES] };
-        if torque != state.commanded {
-            state.commanded = torque;
-            state.coming.push_back((now + u64::from(self.config.act_latency_us) * 1000, torque));
-        }
-        if answer.acted != state.acted {
+        let acted = answer.acted != state.acted;
+        if acted {
             state.acted = answer.acted;
             state.longest_gap_ns = state.longest_gap_ns.max(now - state.acted_ns);
             state.acted_ns = now;
         }
-        state.next_poll_ns = state.clock.reaches(outputs.deadline).max(now + 1);
+        let outputs = answer.outputs;
+        let encoded_ns = self.pump(module, now)?;
+        let state = &mut self.modules[module];
+        if state.controller.is_none() {
+            return Ok(());
+        }
+        let torque = if outputs.motors_enabled { outputs.torque } else { [0.0; AXES] };
+        let ready_ns = encoded_ns + self.act_latency_ns;
+        if torque != state.commanded {
+            state.commanded = torque;
+            state.coming.push_back((ready_ns, torque));
+        }
+        state.busy_until_ns = if acted { ready_ns } else { encoded_ns };
+        let due = state.clock.reaches(outputs.deadline).max(now + 1);
+        // A frame that came while it computed is taken as soon as it can be.
+        let due = if state.port.has_received() { now } else { due };
+        state.next_poll_ns = due.max(state.busy_until_ns);
         self.next_poll_ns = self.next_poll_ns.min(state.next_poll_ns);
-        self.pump(module, now)
+        Ok(())
     }
 
-    /// Hands the controller's frames to its CAN port.
-    fn pump(&mut self, module: usize, now: u64) -> Result<(), SilError> {
+    /// Hands the controller's frames to its CAN port. Returns when what it encoded for them is ready, ns.
+    fn pump(&mut self, module: usize, now: u64) -> Result<u64, SilError> {
         let node = self.node(module);
+        let encoded_ns = now + u64::from(self.config.encode_latency_us) * 1000;
+        let mut ready_ns = now;
         loop {
-            let room = self.bus.room(node);
-            let Some(controller) = self.modules[module].controller.as_mut().filter(|_| room > 0) else { return Ok(()) };
+            let state = &mut self.modules[module];
+            let room = state.port.room();
+            let Some(controller) = state.controller.as_mut().filter(|_| room > 0) else { break };
             let frame = match controller.next_frame(room) {
                 Ok(Some(frame)) => frame,
-                Ok(None) => return Ok(()),
-                Err(trouble) => return self.lose(module, now, trouble),
+                Ok(None) => break,
+                Err(trouble) => {
+                    self.lose(module, now, trouble)?;
+                    break;
+                }
             };
-            let function = frame.function();
-            // What still waits in the port is out of date, pieces of the same latent apart.
-            let same_latent = |waiting: &Frame| {
-                function == Some(Function::LatentFragment)
-                    && waiting.data[0] & 15 == frame.data[0] & 15
-                    && waiting.data[0] != frame.data[0]
-            };
-            self.bus.cancel(node, |waiting| waiting.id == frame.id && !same_latent(waiting));
-            let encoded = matches!(function, Some(Function::Latent | Function::LatentFragment));
-            let latency = if encoded { u64::from(self.config.encode_latency_us) * 1000 } else { 0 };
-            let _ = self.bus.send(node, &frame, now + latency);
+            let encoded = matches!(frame.function(), Some(Function::Latent | Function::LatentFragment));
+            let at = if encoded { encoded_ns } else { now };
+            ready_ns = ready_ns.max(at);
+            state.port.send_at(&frame, at);
         }
+        self.poll_port(node, now, true);
+        Ok(ready_ns)
     }
 
     fn view<P: Plant + ?Sized>(
@@ -1021,12 +1085,13 @@ impl<'c, L: Launcher> Engine<'c, L> {
                     stats: state.controller.as_ref().map_or(state.past, |c| add(&state.past, &c.status().stats)),
                     bus: self.bus.node_stats(node),
                     errors: self.bus.counters(node),
+                    port: state.port.counts(),
                     longest_gap_ms: state.longest_gap_ns.max(last) as f64 / 1e6,
                 }
             })
             .collect();
         let age = modules.iter().map(|module| module.stats.latent_age_max_us).max().unwrap_or(0);
-        let age = if age > 0 { f64::from(age) + f64::from(self.config.act_latency_us) } else { 0.0 };
+        let age = if age > 0 { f64::from(age) + self.act_latency_ns as f64 / 1e3 } else { 0.0 };
         let stats = self.bus.stats();
         Ok(SilReport {
             duration_ns: now,

@@ -1,7 +1,6 @@
 //! The sender on a CAN controller with three slots that sends the most urgent frame first.
 
 use std::collections::VecDeque;
-use std::vec;
 use std::vec::Vec;
 
 use composer_shared::wire::{Goal, Message};
@@ -280,28 +279,4 @@ proptest! {
         }
         prop_assert_eq!(sent.len() as u32, sender.counts().sent);
     }
-}
-
-#[test]
-fn a_port_takes_what_there_is_room_for() {
-    struct Port(Vec<Frame>);
-    impl CanPort for Port {
-        fn send(&mut self, _: Micros, frame: &Frame) {
-            self.0.push(*frame);
-        }
-        fn room(&self) -> usize {
-            2 - self.0.len()
-        }
-        fn receive(&mut self) -> Option<Frame> {
-            None
-        }
-        fn poll(&mut self, _: Micros) {}
-        fn status(&self) -> PortStatus {
-            PortStatus::default()
-        }
-    }
-    let mut port = Port(vec![]);
-    let mut offered = (1..4).map(|mark| frame(Function::State, mark));
-    port.send_all(0, || offered.next());
-    assert_eq!((port.0.len(), offered.count()), (2, 1));
 }

@@ -80,14 +80,8 @@ fn a_node_sends_its_most_urgent_mailbox_first_and_equal_identifiers_in_order() {
     for (id, byte) in [(0x300, 1), (0x300, 2), (0x100, 3)] {
         bus.send(0, &frame(id, byte), 0).unwrap();
     }
-    for byte in 0..MAILBOXES as u8 - 3 {
-        bus.send(0, &frame(0x400, byte), 0).unwrap();
-    }
     assert!(!bus.has_room(0));
     assert_eq!(bus.send(0, &frame(0x000, 9), 0), Err(frame(0x000, 9)));
-    // 3 is on the wire and cannot be taken back any more.
-    assert_eq!(bus.poll(BIT), None);
-    bus.cancel(0, |frame| frame.id == 0x400 || frame.id == 0x100);
     let events = run(&mut bus, 1_000_000);
     let bytes = events.iter().map(|event| match event {
         Event::Delivered { frame, .. } => frame.data[0],
@@ -95,6 +89,30 @@ fn a_node_sends_its_most_urgent_mailbox_first_and_equal_identifiers_in_order() {
     });
     assert_eq!(bytes.collect::<Vec<_>>(), [3, 1, 2]);
     assert!(bus.has_room(0));
+}
+
+#[test]
+fn mail_is_taken_back_unless_it_is_on_the_wire_and_gets_through() {
+    for through in [true, false] {
+        let mut bus = classic(2);
+        let mail = [(0x100, 1), (0x200, 2), (0x300, 3)].map(|(id, byte)| bus.send(0, &frame(id, byte), 0).unwrap());
+        bus.set_disturbance(Disturbance { corrupt: if through { 0.0 } else { 1.0 }, ..Disturbance::default() });
+        // The first is on the wire.
+        assert_eq!(bus.poll(BIT), None);
+        bus.take_back(0, mail[0]);
+        bus.take_back(0, mail[1]);
+        assert_eq!(
+            mail.map(|m| bus.outcome(0, m)),
+            [MailOutcome::Pending, MailOutcome::Returned, MailOutcome::Pending]
+        );
+        bus.set_disturbance(Disturbance::default());
+        let ids: Vec<u16> = delivered(&run(&mut bus, 1_000_000)).iter().map(|d| d.1).collect();
+        // Destroyed, it is not tried again.
+        let (sent, outcome) =
+            if through { (vec![0x100, 0x300], MailOutcome::Sent) } else { (vec![0x300], MailOutcome::Returned) };
+        assert_eq!((ids, bus.outcome(0, mail[0]), bus.outcome(0, mail[2])), (sent, outcome, MailOutcome::Sent));
+        assert_eq!(bus.next_event_ns(), u64::MAX);
+    }
 }
 
 /// Rule c, exception 1: without acknowledgement the transmit counter stops where the node becomes error passive.

@@ -258,17 +258,53 @@ fn late_and_repeated_frames_do_no_harm() {
 /// A CAN bus has no cure for a node that floods it with a high priority: SYNC gets through, nothing else does. Without
 /// STATE, LATENT and GOAL each module acts on its own; nothing worse happens, and all is well afterwards.
 #[test]
-fn a_babbling_node_blinds_the_modules_but_the_beat_goes_on() {
-    let mut toy = Toy::new(8, 125);
-    let (report, seen) = simulate(&mut toy, &with_faults(BusKind::Fd, "babble:#5@1s..3s", 8));
-    let during = &seen[50];
-    for module in 0..8 {
-        assert_eq!(during.heard[module], 1 << module, "hears nobody's latent");
+fn babble_does_not_make_every_module_its_own_time_keeper() {
+    for bus in [BusKind::Fd, BusKind::Classic] {
+        let mut toy = Toy::new(8, 125);
+        let (report, seen) = simulate(&mut toy, &with_faults(bus, "babble:#5@1s..3s", 8));
+        let during = &seen[50];
+        for module in 0..8 {
+            assert_eq!(during.heard[module], 1 << module, "hears nobody's latent");
+        }
+        assert!(seen.iter().all(|s| s.keepers.iter().all(|keeper| *keeper == Some(0))), "the head keeps the time");
+        assert!(report.bus_load > 0.3);
+        for (number, module) in report.modules.iter().enumerate() {
+            assert!(module.stats.acted >= 120 && module.longest_gap_ms < 150.0, "{module:?}");
+            assert_eq!(module.stats.takeovers, u32::from(number == 0), "{module:?}");
+            assert!(module.port.displaced > 0 || number > 0, "{module:?}");
+        }
+        let last = seen.last().unwrap();
+        assert!(last.heard.iter().all(|h| *h == 0xff) && last.faults.iter().all(Vec::is_empty), "{last:?}");
     }
-    assert!(report.bus_load > 0.3);
-    assert!(report.modules.iter().all(|m| m.stats.acted >= 120 && m.longest_gap_ms < 150.0), "{report:?}");
-    let last = seen.last().unwrap();
-    assert!(last.heard.iter().all(|h| *h == 0xff) && last.faults.iter().all(Vec::is_empty), "{last:?}");
+}
+
+/// The instructions of a control step grow with the number of modules, and so does the time until it acts.
+#[test]
+fn acting_takes_what_the_microcontroller_needs_for_that_many_modules() {
+    for (modules, least, most) in [(8, 0.58, 0.75), (64, 2.33, 3.0)] {
+        let age = |act_latency_us| {
+            let config = SilConfig { act_latency_us, ..SilConfig::new(BusKind::Fd) };
+            simulate(&mut Toy::new(modules, 20), &config).0.latent_age_max_ms
+        };
+        let acting = age(None) - age(Some(0));
+        assert!((least..most).contains(&acting), "{acting} ms for {modules} modules");
+    }
+}
+
+/// While a module computes nobody takes its received frames; they wait, and none is lost in any robot.
+#[test]
+fn received_frames_wait_while_a_module_computes() {
+    for (modules, plan) in [(8, "none"), (64, "none"), (64, "drop:0.05"), (16, "babble:#5")] {
+        let (report, _) = simulate(&mut Toy::new(modules, 20), &with_faults(BusKind::Fd, plan, modules));
+        assert!(report.modules.iter().all(|module| module.port.overflowed == 0), "{modules} {plan}: {report:?}");
+    }
+    // A computer that is much too slow loses some, counts them, and the robot goes on.
+    let slow = SilConfig { act_latency_us: Some(20_000), ..with_faults(BusKind::Fd, "babble:#5/0x7FF", 8) };
+    let (report, _) = simulate(&mut Toy::new(8, 40), &slow);
+    for (number, module) in report.modules.iter().enumerate() {
+        assert!(module.port.overflowed > 1000 || number == 5, "{module:?}");
+        assert!(module.stats.acted >= 38, "{module:?}");
+    }
 }
 
 /// With the most urgent identifier of all not even SYNC gets through: everybody relaxes, and comes back afterwards.
