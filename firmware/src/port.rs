@@ -12,9 +12,9 @@
 //!   true before;
 //! - what waited when the CAN controller went bus-off is given up, and again when it comes back.
 //!
-//! The one exception is EMERGENCY_STOP: it waits as long as it takes. Its counter tells receivers whether it still means something.
+//! The one exception is a stop: it waits as long as it takes. Its count tells receivers whether it still means something. A release does not.
 
-use composer_shared::wire::{Frame, Function};
+use composer_shared::wire::{Frame, Function, StopCommand};
 
 use crate::controller::{BusStatus, Micros};
 
@@ -134,10 +134,15 @@ pub fn supersedes(new: &Frame, old: &Frame) -> bool {
         }
 }
 
-/// How long a frame is worth sending, in a robot with this control period: control traffic a period, reports and the like ten; a stop for ever.
+fn is_stop(frame: &Frame) -> bool {
+    let [command, ..] = frame.data;
+    frame.function() == Some(Function::EmergencyStop) && command == StopCommand::Stop as u8
+}
+
+/// How long a frame is worth sending, in a robot with this control period: control traffic a period, reports and answers ten; a stop for ever.
 pub fn lifetime(frame: &Frame, period: Micros) -> Micros {
     match frame.function() {
-        Some(Function::EmergencyStop) => Micros::MAX,
+        Some(Function::EmergencyStop) if is_stop(frame) => Micros::MAX,
         Some(Function::Sync | Function::Goal | Function::State | Function::Latent | Function::LatentFragment) => period,
         _ => 10 * period,
     }
@@ -266,7 +271,7 @@ impl Sender {
             count(&mut self.counts.bus_off);
         }
         self.off = off;
-        let stop = |queued: &Queued| queued.frame.function() == Some(Function::EmergencyStop);
+        let stop = |queued: &Queued| is_stop(&queued.frame);
         for place in &mut self.waiting {
             if place.take_if(|queued| !stop(queued)).is_some() {
                 count(&mut self.counts.stale);

@@ -412,7 +412,7 @@ mod tests {
             file.write_all(b"O\r").unwrap();
             frames(&file, |frame| frame.id == 0x080);
             // The last words count, although their speaker is gone at once.
-            file.write_all(b"b07F20100\r").unwrap();
+            file.write_all(b"b07F3010000\r").unwrap();
             drop(file);
             std::thread::sleep(Duration::from_millis(200));
             let mut file = serial(&path);

@@ -49,6 +49,7 @@ pub fn decode(get: impl Fn(usize) -> u32) -> Option<Frame> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use composer_shared::wire::{Message, StopCommand};
     use std::vec::Vec;
 
     fn written(frame: &Frame) -> Vec<u32> {
@@ -78,13 +79,16 @@ mod tests {
         }
     }
 
-    /// `cansend can0 003#0100` and every frame that a DBC calls StandardCAN.
+    /// `cansend can0 003#010000` and every frame that a DBC calls StandardCAN.
     #[test]
     fn the_board_understands_a_stop_in_a_classic_frame() {
-        let frame = read(&[0x003 << 18, 2 << 16, 0xffff_0001]).unwrap();
-        assert_eq!((frame.id, frame.fd, frame.brs, frame.payload()), (0x003, false, false, &[1, 0][..]));
+        let frame = read(&[0x003 << 18, 3 << 16, 0xff00_0001]).unwrap();
+        assert_eq!((frame.id, frame.fd, frame.brs, frame.payload()), (0x003, false, false, &[1, 0, 0][..]));
+        assert!(
+            matches!(Message::parse(&frame), Ok(Message::EmergencyStop(stop)) if stop.command() == StopCommand::Stop)
+        );
         // What is beyond the length does not count, nor do the time stamp and the number of the filter.
-        assert_eq!(read(&[0x003 << 18, 0x8500_1234 | 2 << 16, 1]), Some(frame));
+        assert_eq!(read(&[0x003 << 18, 0x8500_1234 | 3 << 16, 1]), Some(frame));
     }
 
     #[test]

@@ -220,6 +220,7 @@ fn bus_off_forgets_all_but_a_stop() {
     sender.poll(2, &mut chip);
     sender.push(3, &frame(Function::Sync, 2));
     sender.poll(3, &mut chip);
+    assert_eq!(lifetime(&frame(Function::EmergencyStop, StopCommand::Release as u8), PERIOD), 10 * PERIOD);
     assert_eq!(chip.ids(), [], "nothing goes to a CAN controller that is bus-off");
     sender.set_bus_off(false);
     sender.push(4, &frame(Function::State, 3));
