@@ -13,7 +13,7 @@ use composer_sim_bridge::external_plant::Address;
 use composer_sim_bridge::faults::{FaultKind, FaultPlan, PlannedFault};
 use composer_sim_bridge::frame_bits::BitRates;
 use composer_sim_bridge::qemu::Qemu;
-use composer_sim_bridge::sil::{self, SilConfig, SilReport};
+use composer_sim_bridge::sil::{self, CycleView, Outside, SilConfig, SilReport};
 use serde::Serialize;
 
 use crate::env::EnvConfig;
@@ -238,12 +238,7 @@ impl BusTrial<'_> {
         Ok(Outcome { plant, report })
     }
 
-    /// Runs all episodes. `progress` is called after each.
-    pub fn run(
-        &self,
-        capture: Option<&mut dyn Write>,
-        progress: &(dyn Fn() + Sync),
-    ) -> Result<(BusReport, Vec<crate::replay::Episode>)> {
+    fn check(&self) -> Result<()> {
         self.fault.check(self.config.robot.modules)?;
         if self.bus.drop.is_some_and(|p| !(0.0..=1.0).contains(&p)) {
             bail!("--drop is a probability: 0 to 1");
@@ -251,6 +246,44 @@ impl BusTrial<'_> {
         if self.bus.delay.is_some_and(|ms| !(0.0..=1000.0).contains(&ms)) {
             bail!("--delay is 0 to 1000 ms");
         }
+        Ok(())
+    }
+
+    /// Runs the first episode with somebody outside, who may be its station, until they end it or for `limit_ns`. It goes on when the task is done.
+    pub fn live(
+        &self,
+        outside: &mut dyn Outside,
+        station: bool,
+        limit_ns: u64,
+        capture: Option<&mut dyn Write>,
+    ) -> Result<SilReport> {
+        self.check()?;
+        let seed = episode_seed(self.seed, 0);
+        let sil = SilConfig { station, limit_ns, ..self.sil_config(seed) };
+        let policy = Policy::parse(self.image).map_err(|e| anyhow::anyhow!("{e}"))?;
+        let mut plant = match &self.elsewhere {
+            Some(elsewhere) => SnakePlant::elsewhere(self.config.clone(), seed, elsewhere)?,
+            None => SnakePlant::new(self.config.clone(), seed),
+        };
+        plant.make_endless();
+        let (outside, observer) = (Some(outside), &mut |_: &CycleView<'_>, _: &SnakePlant| {});
+        let report = match self.qemu {
+            Some(qemu) => sil::run_with(qemu, &mut plant, policy, &sil, outside, capture, observer),
+            None => sil::run_with(&InProcess::new(policy), &mut plant, policy, &sil, outside, capture, observer),
+        }?;
+        match plant.trouble() {
+            Some(trouble) => bail!("at {:.3} s {trouble}", report.duration_ns as f64 * 1e-9),
+            None => Ok(report),
+        }
+    }
+
+    /// Runs all episodes. `progress` is called after each.
+    pub fn run(
+        &self,
+        capture: Option<&mut dyn Write>,
+        progress: &(dyn Fn() + Sync),
+    ) -> Result<(BusReport, Vec<crate::replay::Episode>)> {
+        self.check()?;
         let mut runs = Vec::with_capacity(self.episodes);
         let alone = usize::from(capture.is_some());
         if capture.is_some() {

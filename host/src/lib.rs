@@ -1,5 +1,6 @@
 //! The host of COMPOSER: physics, tasks, training, evaluation, export and the command line.
 
+pub mod bus;
 pub mod bus_trial;
 pub mod cli;
 pub mod env;

@@ -26,6 +26,7 @@ pub struct SnakePlant {
     torques: Vec<[u32; AXES]>,
     /// The same of every physics step so far, module by module, if it is kept.
     trace: Option<Vec<[u32; AXES]>>,
+    endless: bool,
 }
 
 impl SnakePlant {
@@ -34,7 +35,7 @@ impl SnakePlant {
         let config = config.drawn(seed);
         let (snake, judge) = config.start(seed);
         let torques = vec![[0; AXES]; config.robot.modules];
-        SnakePlant { config, snake, external: None, judge, physics_steps: 0, torques, trace: None }
+        SnakePlant { config, snake, external: None, judge, physics_steps: 0, torques, trace: None, endless: false }
     }
 
     /// The same episode, of a plant elsewhere.
@@ -50,6 +51,11 @@ impl SnakePlant {
     /// Why the plant elsewhere did not go on to the end, if so: then nothing about the episode means anything.
     pub fn trouble(&self) -> Option<&PlantError> {
         self.external.as_ref().and_then(External::trouble)
+    }
+
+    /// Goes on when the task is done or its time is over, for people who look on.
+    pub fn make_endless(&mut self) {
+        self.endless = true;
     }
 
     /// Keeps the torques of every physics step from now on.
@@ -113,7 +119,8 @@ impl Plant for SnakePlant {
     }
 
     fn done(&self) -> bool {
-        self.judge.verdict().success || self.judge.steps() >= self.config.cap() || self.trouble().is_some()
+        let over = self.judge.verdict().success || self.judge.steps() >= self.config.cap();
+        over && !self.endless || self.trouble().is_some()
     }
 }
 

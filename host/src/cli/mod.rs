@@ -1,6 +1,7 @@
 //! The command line. Every verb is a thin layer over the library.
 
 mod bench;
+mod bus;
 mod common;
 mod dbc;
 mod demo;
@@ -50,6 +51,8 @@ enum Verb {
     Demo(demo::OneTask),
     /// Make a module of a board: image, policy and node page by a debug probe.
     Flash(flash::Arguments),
+    /// Watch and command a robot on its bus, a real one or a simulated one in real time.
+    Bus(bus::Arguments),
     /// Print the bus's message database in DBC form.
     Dbc(dbc::Arguments),
     /// Print robot and scene as a model for MuJoCo.
@@ -83,6 +86,7 @@ pub fn main() -> ExitCode {
         Some(Verb::Report(arguments)) => report::run(&arguments),
         Some(Verb::Bench(arguments)) => bench::run(&arguments),
         Some(Verb::Flash(arguments)) => flash::run(&arguments),
+        Some(Verb::Bus(arguments)) => bus::run(&arguments),
         Some(Verb::Dbc(arguments)) => dbc::run(&arguments),
         Some(Verb::Mjcf(arguments)) => mjcf::run(&arguments),
         Some(Verb::Demo(arguments)) => demo::run_one(&arguments),
@@ -95,6 +99,24 @@ pub fn main() -> ExitCode {
             ExitCode::FAILURE
         }
     }
+}
+
+/// Becomes true when somebody wants this program to end: Ctrl-C, SIGTERM, a terminal that closes. A second Ctrl-C ends it at once.
+fn interrupted() -> std::io::Result<std::sync::Arc<std::sync::atomic::AtomicBool>> {
+    use std::sync::{Arc, atomic::AtomicBool};
+    let flag = Arc::new(AtomicBool::new(false));
+    #[cfg(unix)]
+    use signal_hook::consts::SIGHUP;
+    for signal in [
+        signal_hook::consts::SIGINT,
+        signal_hook::consts::SIGTERM,
+        #[cfg(unix)]
+        SIGHUP,
+    ] {
+        signal_hook::flag::register_conditional_shutdown(signal, 130, Arc::clone(&flag))?;
+        signal_hook::flag::register(signal, Arc::clone(&flag))?;
+    }
+    Ok(flag)
 }
 
 /// A task by its name, for the command line.

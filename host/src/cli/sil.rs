@@ -120,6 +120,31 @@ impl PlantOptions {
     }
 }
 
+/// The bus in real time.
+#[derive(clap::Args, Clone, Debug)]
+pub struct LiveOptions {
+    /// Offer the bus to other programs in real time, as a serial CAN adapter: slcan:PATH, a link to a pseudo-terminal; may be given several times.
+    /// Goes on until Ctrl-C
+    #[arg(long, value_name = "slcan:PATH", value_parser = live_path, conflicts_with_all = ["parity", "replay", "published", "episodes"])]
+    live: Vec<PathBuf>,
+    /// How many times as fast as real time
+    #[arg(long, value_name = "X", default_value_t = 1.0, requires = "live")]
+    pace: f64,
+    /// No station on the bus: whoever opens the terminal is the station
+    #[arg(long, requires = "live")]
+    no_station: bool,
+    /// End after so many seconds of the simulation
+    #[arg(long, value_name = "S", requires = "live")]
+    seconds: Option<f64>,
+}
+
+fn live_path(text: &str) -> Result<PathBuf, String> {
+    match text.strip_prefix("slcan:") {
+        Some(path) if !path.is_empty() => Ok(path.into()),
+        _ => Err("the bus is offered as slcan:PATH, where PATH is where the terminal is to be found".into()),
+    }
+}
+
 /// Arguments of `sil`.
 #[derive(clap::Args, Clone, Debug)]
 pub struct Arguments {
@@ -131,6 +156,8 @@ pub struct Arguments {
     emulation: Emulation,
     #[command(flatten)]
     plant: PlantOptions,
+    #[command(flatten)]
+    live: LiveOptions,
     /// Write the frames of the first episode as a candump log
     #[arg(long, value_name = "FILE")]
     capture: Option<PathBuf>,
@@ -169,6 +196,10 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     };
     let mut captured = Vec::new();
     let capture: Option<&mut dyn Write> = if arguments.capture.is_some() { Some(&mut captured) } else { None };
+    if !arguments.live.live.is_empty() {
+        run_live(&trial, &arguments.live, capture)?;
+        return arguments.capture.iter().try_for_each(|path| write_whole(path, &captured));
+    }
     let bar = common.bar();
     let (report, recorded) = trial.run(capture, &|| bar.inc(1))?;
     bar.finish_and_clear();
@@ -191,6 +222,46 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         bail!("the emulated modules and those in this process do not do the same: see the line about parity");
     }
     Ok(())
+}
+
+/// Offers the bus in real time until Ctrl-C.
+#[cfg(unix)]
+fn run_live(trial: &BusTrial<'_>, options: &LiveOptions, capture: Option<&mut dyn Write>) -> Result<()> {
+    use composer_sim_bridge::live::{Live, Terminal};
+    if !(0.001..=1000.0).contains(&options.pace) {
+        bail!("--pace is 0.001 to 1000 times real time");
+    }
+    if options.seconds.is_some_and(|seconds| !(0.001..=1e9).contains(&seconds)) {
+        bail!("--seconds is 0.001 to 1000000000");
+    }
+    let ended = super::interrupted()?;
+    let open = |path: &PathBuf| Terminal::open(path, trial.bus.kind == BusKind::Fd);
+    let terminals = options.live.iter().map(open).collect::<Result<Vec<_>, _>>()?;
+    for path in &options.live {
+        eprintln!("{} modules on the bus slcan:{}; Ctrl-C ends it", trial.config.robot.modules, path.display());
+    }
+    let mut live = Live::new(terminals, options.pace, &ended);
+    let limit_ns = options.seconds.map_or(u64::MAX, |seconds| (seconds * 1e9) as u64);
+    let report = trial.live(&mut live, !options.no_station, limit_ns, capture)?;
+    for lost in &report.lost {
+        eprintln!("note: module {} was lost at {:.3} s: {}", lost.module, lost.at_ns as f64 * 1e-9, lost.how);
+    }
+    let frames: u64 = live.terminals().iter().map(Terminal::lost).sum();
+    if frames > 0 {
+        eprintln!("note: {frames} frames were lost because a program did not read its terminal");
+    }
+    let behind = live.behind().as_secs_f64();
+    println!(
+        "{:.1} s simulated, {} frames, {behind:.1} s behind the clock",
+        report.duration_ns as f64 * 1e-9,
+        report.frames
+    );
+    Ok(())
+}
+
+#[cfg(not(unix))]
+fn run_live(_: &BusTrial<'_>, _: &LiveOptions, _: Option<&mut dyn Write>) -> Result<()> {
+    bail!("--live needs pseudo-terminals, which Linux and macOS have");
 }
 
 /// Says so if the frames of a cycle do not fit the control period (at the default bit rates): it still runs, but the tail is never heard.
