@@ -3,6 +3,7 @@
 //! - [`encoder`]: the angle of a joint, AS5047P over SPI.
 //! - [`imu`]: specific force and angular rate, LSM6DSO over SPI.
 //! - [`motor`]: an H-bridge with a current loop.
+//! - [`stage`]: both motors of a module in step, with the supply.
 //! - [`thermistor`]: the temperature of a motor.
 //! - [`sensors`]: all of a module's sensors together, as the controller wants them.
 //!
@@ -13,4 +14,5 @@ pub mod encoder;
 pub mod imu;
 pub mod motor;
 pub mod sensors;
+pub mod stage;
 pub mod thermistor;

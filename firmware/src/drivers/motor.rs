@@ -10,7 +10,10 @@
 //! # Cut-off
 //!
 //! [`TRIP_AFTER`] samples in a row beyond the cut-off current, a current that is not a number, or an output that fails let the motor coast
-//! until [`Motor::rearm`]: [`Motor::trip`] says why. Without supply it coasts, too, but goes on by itself.
+//! until [`Motor::rearm`]: [`Motor::trip`] says why. How often it may be rearmed is for [`crate::trips`] to say.
+//!
+//! Without supply it coasts, too. When the supply is back it does not pull with all that was asked of it at once: it stays [starved](Motor::starved) until it was
+//! told to coast, which is what the controller does at the fault that follows ([`crate::supply`]); torque then grows from zero.
 
 use embedded_hal::digital::OutputPin;
 use embedded_hal::pwm::SetDutyCycle;
@@ -74,6 +77,7 @@ pub struct Motor<P, D, E> {
     integral: f32,
     beyond: u8,
     trip: Option<Trip>,
+    starved: bool,
     driving: bool,
 }
 
@@ -89,6 +93,7 @@ impl<P: SetDutyCycle, D: OutputPin, E: OutputPin> Motor<P, D, E> {
             integral: 0.0,
             beyond: 0,
             trip: None,
+            starved: false,
             driving: true,
         };
         motor.coast();
@@ -102,6 +107,7 @@ impl<P: SetDutyCycle, D: OutputPin, E: OutputPin> Motor<P, D, E> {
             .map(|torque| torque / self.config.torque_constant)
             .filter(|current| !current.is_nan())
             .map(|current| current.max(-limit).min(limit));
+        self.starved &= self.set_point.is_some();
     }
 
     /// The torque that a measured current (A) means.
@@ -117,7 +123,8 @@ impl<P: SetDutyCycle, D: OutputPin, E: OutputPin> Motor<P, D, E> {
             return 0.0;
         };
         // Also without a reading of the supply.
-        if supply.is_nan() || supply < self.config.lowest_supply {
+        self.starved |= supply.is_nan() || supply < self.config.lowest_supply;
+        if self.starved {
             self.coast();
             return 0.0;
         }
@@ -151,6 +158,11 @@ impl<P: SetDutyCycle, D: OutputPin, E: OutputPin> Motor<P, D, E> {
         } else {
             self.driving = false;
         }
+    }
+
+    /// Whether the motor had to coast for want of supply and has not been told to coast since.
+    pub fn starved(&self) -> bool {
+        self.starved
     }
 
     /// Why the motor coasts until it is rearmed, if it does.
@@ -190,7 +202,7 @@ impl<P: SetDutyCycle, D: OutputPin, E: OutputPin> Motor<P, D, E> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use embedded_hal_mock::eh1::MockError;
     use embedded_hal_mock::eh1::digital::{Mock as Pin, State, Transaction as Set};
@@ -211,11 +223,11 @@ mod tests {
         period: 1e-4,
         lowest_supply: 6.0,
     };
-    const SUPPLY: f32 = 12.0;
+    pub const SUPPLY: f32 = 12.0;
 
     /// What the bridge was told, shared with the test.
     #[derive(Clone, Default)]
-    struct Line(Rc<Cell<u16>>);
+    pub struct Line(pub Rc<Cell<u16>>);
 
     impl embedded_hal::pwm::ErrorType for Line {
         type Error = Infallible;
@@ -373,8 +385,13 @@ mod tests {
             assert_eq!((bench.enable.0.get(), bench.pwm.0.get()), (0, 0));
         }
         bench.supply = SUPPLY;
+        bench.run(10);
+        assert_eq!(bench.enable.0.get(), 0, "the supply is back, and nobody has said that the motor may be");
+        bench.motor.set_torque(None);
         bench.run(1);
-        assert_eq!(bench.enable.0.get(), 1, "the supply is back");
+        bench.motor.set_torque(Some(40.0));
+        bench.run(1);
+        assert_eq!(bench.enable.0.get(), 1);
         for torque in [None, Some(f32::NAN)] {
             bench.motor.set_torque(Some(40.0));
             bench.run(2);
@@ -384,6 +401,25 @@ mod tests {
         }
         bench.motor.step(f32::NAN, SUPPLY);
         assert_eq!(bench.motor.trip(), Some(Trip::CurrentSense));
+    }
+
+    #[test]
+    fn a_supply_that_comes_back_does_not_bring_back_the_torque() {
+        let mut bench = Bench::new(CONFIG);
+        bench.motor.set_torque(Some(80.0));
+        bench.run(100);
+        assert!((bench.current - 1.0).abs() < 0.01);
+        bench.supply = 5.0;
+        bench.run(1);
+        bench.supply = SUPPLY;
+        // It used to have 95 % of the torque again after 0.8 ms.
+        for _ in 0..1000 {
+            bench.motor.set_torque(Some(80.0));
+            bench.run(1);
+            assert_eq!((bench.current, bench.motor.starved(), bench.motor.trip()), (0.0, true, None));
+        }
+        bench.motor.set_torque(None);
+        assert!(!bench.motor.starved());
     }
 
     #[test]

@@ -1,11 +1,13 @@
 //! The motors: PWM, current measurement and current loops, in step with each other.
 //!
 //! TIM1 counts up and down 20,000 times a second. At every second valley, in the middle of the time in which the bridge is on, where the current is at
-//! its mean, it triggers ADC1; when that is done its interrupt runs both current loops.
+//! its mean, it triggers ADC1; when that is done its interrupt runs both current loops ([`composer_firmware::drivers::stage`]).
 
 use core::cell::{Cell, RefCell};
 
-use composer_firmware::drivers::motor::{Motor, MotorConfig, Trip};
+use composer_firmware::drivers::motor::Motor;
+use composer_firmware::drivers::stage::{self, Readings, motor_config};
+pub use composer_firmware::drivers::stage::{Command, Measured};
 use composer_firmware::node_page::MotorCalibration;
 use composer_shared::robot::AXES;
 use embassy_stm32::adc::{Adc, AdcChannel, Exten, InjectedAdc, SampleTime};
@@ -19,53 +21,24 @@ use embassy_stm32::{Peri, interrupt, pac, triggers};
 use embassy_sync::blocking_mutex::Mutex;
 use embassy_sync::blocking_mutex::raw::CriticalSectionRawMutex;
 
-use crate::sense::ADC_RANGE;
+use crate::board::ADC_RANGE;
 
 const PWM: Hertz = Hertz(20_000);
 /// Time between two runs of the current loops, s.
 const PERIOD: f32 = 1e-4;
 /// Bandwidth of the current loops, rad/s: 500 Hz, a twentieth of their rate.
 const BANDWIDTH: f32 = 3142.0;
-/// Below this the bridges switch themselves off.
-const LOWEST_SUPPLY: f32 = 6.0;
 /// Supply voltage at full scale: 3.3 V over the divider of 10 kohm and 1 kohm.
 const SUPPLY_RANGE: f32 = 3.3 * 11.0;
-/// Weight of a new sample in the mean that the controller sees: about a millisecond.
-const SMOOTHING: f32 = 0.1;
-
-/// What the main loop wants.
-#[derive(Clone, Copy)]
-pub struct Command {
-    /// Torques, yaw and pitch, in the robot's torque unit; none: coast.
-    pub torque: Option<[f32; AXES]>,
-    /// Allow motors that were cut off again.
-    pub rearm: bool,
-}
-
-/// What the current loops report.
-#[derive(Clone, Copy)]
-pub struct Measured {
-    /// Torques by the currents, in the robot's torque unit.
-    pub torque: [f32; AXES],
-    /// What cut a motor off.
-    pub trip: [Option<Trip>; AXES],
-    /// Counts the runs of the loops.
-    pub loops: u32,
-}
 
 type Axis = Motor<SimplePwmChannel<'static, TIM1>, Output<'static>, Output<'static>>;
-
-struct Stage {
-    adc: InjectedAdc<'static, ADC1, 3>,
-    axes: [(Axis, MotorCalibration); AXES],
-}
+type Stage = stage::Stage<SimplePwmChannel<'static, TIM1>, Output<'static>, Output<'static>>;
 
 type Shared<T> = Mutex<CriticalSectionRawMutex, T>;
 
-static COMMAND: Shared<Cell<Command>> = Mutex::new(Cell::new(Command { torque: None, rearm: false }));
-static MEASURED: Shared<Cell<Measured>> =
-    Mutex::new(Cell::new(Measured { torque: [0.0; AXES], trip: [None; AXES], loops: 0 }));
-static STAGE: Shared<RefCell<Option<Stage>>> = Mutex::new(RefCell::new(None));
+static COMMAND: Shared<Cell<Command>> = Mutex::new(Cell::new(Command { torque: None, rearm: [false; AXES] }));
+static MEASURED: Shared<Cell<Measured>> = Mutex::new(Cell::new(Measured::NOTHING));
+static STAGE: Shared<RefCell<Option<(InjectedAdc<'static, ADC1, 3>, Stage)>>> = Mutex::new(RefCell::new(None));
 
 /// The pins of both bridges, yaw and pitch.
 pub struct Bridges {
@@ -119,7 +92,7 @@ pub fn start(
     let time = SampleTime::CYCLES24_5;
     let sequence = [(yaw.degrade_adc(), time), (pitch.degrade_adc(), time), (supply.degrade_adc(), time)];
     let adc = adc.setup_injected_conversions(sequence, triggers::TIM1_TRGO2, Exten::RISING_EDGE, true);
-    STAGE.lock(|stage| *stage.borrow_mut() = Some(Stage { adc, axes }));
+    STAGE.lock(|stage| *stage.borrow_mut() = Some((adc, Stage::new(axes, SUPPLY_RANGE))));
     // SAFETY: the handler only touches what is behind a lock, and that is complete now.
     unsafe { interrupt::ADC1_2.enable() };
 }
@@ -130,62 +103,37 @@ fn axis(
     enable: Output<'static>,
     calibration: &MotorCalibration,
 ) -> Axis {
-    let config = MotorConfig {
-        torque_constant: calibration.torque_constant,
-        current_limit: calibration.current_limit,
-        cut_off: calibration.cut_off,
-        resistance: calibration.resistance,
-        inductance: calibration.inductance,
-        bandwidth: BANDWIDTH,
-        period: PERIOD,
-        lowest_supply: LOWEST_SUPPLY,
-    };
-    Motor::new(pwm, direction, enable, config)
+    Motor::new(pwm, direction, enable, motor_config(calibration, BANDWIDTH, PERIOD))
 }
 
 /// Sets what the current loops do from now on.
 pub fn command(command: Command) {
-    let Command { torque, rearm } = command;
-    // A rearming that the loops have not seen yet stays.
-    COMMAND.lock(|shared| shared.set(Command { torque, rearm: rearm || shared.get().rearm }));
+    COMMAND.lock(|shared| shared.set(command.after(shared.get())));
 }
 
-/// What the current loops measured last.
+/// What the current loops measured, and the extremes of the supply since the last call.
 pub fn measured() -> Measured {
-    MEASURED.lock(Cell::get)
-}
-
-impl Stage {
-    fn run(&mut self, command: Command, last: Measured) -> Measured {
-        let [yaw, pitch, supply] = self.adc.read_injected_samples().map(|raw| f32::from(raw) / ADC_RANGE);
-        let mut measured = Measured { loops: last.loops.wrapping_add(1), ..last };
-        let reports = measured.torque.iter_mut().zip(&mut measured.trip);
-        for (i, ((motor, calibration), (torque, trip))) in self.axes.iter_mut().zip(reports).enumerate() {
-            if command.rearm {
-                motor.rearm();
-            }
-            let current = calibration.current(if i == 0 { yaw } else { pitch });
-            motor.set_torque(command.torque.and_then(|torque| torque.get(i).copied()));
-            motor.step(current, supply * SUPPLY_RANGE);
-            *torque += SMOOTHING * (motor.torque(current) - *torque);
-            *trip = motor.trip();
-        }
+    MEASURED.lock(|shared| {
+        let measured = shared.get();
+        shared.set(measured.taken());
         measured
-    }
+    })
 }
 
 #[embassy_stm32::interrupt]
 fn ADC1_2() {
     let command = COMMAND.lock(|shared| {
         let command = shared.get();
-        shared.set(Command { torque: command.torque, rearm: false });
+        shared.set(command.seen());
         command
     });
     STAGE.lock(|stage| {
         if let Ok(mut stage) = stage.try_borrow_mut()
-            && let Some(stage) = stage.as_mut()
+            && let Some((adc, stage)) = stage.as_mut()
         {
-            MEASURED.lock(|shared| shared.set(stage.run(command, shared.get())));
+            let [yaw, pitch, supply] = adc.read_injected_samples().map(|raw| f32::from(raw) / ADC_RANGE);
+            let readings = Readings { currents: [yaw, pitch], supply };
+            MEASURED.lock(|shared| shared.set(stage.run(command, shared.get(), readings)));
         }
     });
 }

@@ -16,23 +16,25 @@
 //! | PA0, PA1 | ADC1 IN1, IN2 | current sense of yaw, pitch: an amplifier in the motor line (for example INA240), half the range at no current |
 //! | PA2 | ADC1 IN3 | supply voltage over 10 kohm : 1 kohm |
 //! | PC4, PC5 | ADC2 IN5, IN11 | thermistors of yaw, pitch: 10 kohm, 3435 K, below 10 kohm |
-//! | PB10 | status light | on: running; flashing once: no node page, twice: no policy |
+//! | PB10 | status light | on: running; flashing once: no node page, twice: no policy, three times: no crystal |
 //! | PA13, PA14 | SWDIO, SWCLK | debug probe: flashing, and the log (defmt over RTT) |
 //!
 //! # Who runs when
 //!
-//! - The interrupt of the ADC, 10,000 times a second: the current loops ([`drive`]).
+//! - The interrupt of the ADC, 10,000 times a second: the current loops ([`drive`]). Nothing interrupts it ([`board`]).
 //! - The interrupts of FDCAN: received frames into a queue, because the chip's own holds only three ([`can`]).
 //! - The main loop: waits for a frame, the controller's deadline, or the next sample of the sensors a millisecond later; polls the
 //!   controller, sets the motors, sends what it offers.
 //!
 //! The independent watchdog is fed by the main loop and only if the current loops ran since the last time. Anything that stops either
-//! resets the chip within [`WATCHDOG_US`]; then all pins float and the motors coast.
+//! resets the chip within [`board::WATCHDOG_US`]; then all pins float and the motors coast. It runs before anything is waited for. If the crystal does not
+//! oscillate, the chip runs on its internal oscillator, says so by light and log, and stays off the bus.
 //!
 //! This image was built and looked at, but has not run on a chip yet.
 #![no_std]
 #![no_main]
 
+mod board;
 mod can;
 mod drive;
 mod fail;
@@ -46,7 +48,6 @@ use composer_firmware::node_page::NodePage;
 use composer_firmware::storage::read_page;
 use composer_shared::observation::Sensors;
 use composer_shared::policy::Policy;
-use composer_shared::robot::AXES;
 use composer_shared::wire::{Fault, Health, Heartbeat, Message, Mode, NOBODY, PROTOCOL_VERSION};
 use defmt::Display2Format;
 use defmt_rtt as _;
@@ -54,14 +55,12 @@ use embassy_executor::Spawner;
 use embassy_stm32::adc::{Adc, AdcConfig};
 use embassy_stm32::bind_interrupts;
 use embassy_stm32::gpio::{Level, Output, Speed};
-use embassy_stm32::peripherals::{FDCAN1, IWDG};
-use embassy_stm32::rcc::{self, mux};
+use embassy_stm32::peripherals::FDCAN1;
 use embassy_stm32::spi::{MODE_1, MODE_3, Spi};
-use embassy_stm32::time::Hertz;
-use embassy_stm32::wdg::IndependentWatchdog;
 use embassy_time::{Duration, Instant, Timer, with_deadline};
 use static_cell::StaticCell;
 
+use board::{Board, Watchdog};
 use can::CanPort;
 use flash::Storage;
 use sense::Sense;
@@ -73,35 +72,11 @@ bind_interrupts!(struct Irqs {
 
 defmt::timestamp!("{=u64:us}", now());
 
-type Watchdog = IndependentWatchdog<'static, IWDG>;
-
-/// One control period: a module that hangs pulls no longer than that.
-const WATCHDOG_US: u32 = 50_000;
 /// Time between two samples of the sensors; the inertial sensor has a new one every 0.6 ms.
 const SAMPLE: Duration = Duration::from_millis(1);
 /// Time between two HEARTBEAT frames of a module without a policy. Every one of them makes the others wait for its latent for three
 /// cycles, so they are rare.
 const REFUSED_HEARTBEAT: Duration = Duration::from_secs(2);
-
-/// 170 MHz for the core, the timers and FDCAN, from the crystal.
-fn clocks() -> rcc::Config {
-    let mut config = rcc::Config::new();
-    config.hse = Some(rcc::Hse { freq: Hertz(24_000_000), mode: rcc::HseMode::Oscillator });
-    config.hsi48 = None;
-    config.pll = Some(rcc::Pll {
-        source: rcc::PllSource::HSE,
-        prediv: rcc::PllPreDiv::DIV6,
-        mul: rcc::PllMul::MUL85,
-        divp: None,
-        divq: Some(rcc::PllQDiv::DIV2),
-        divr: Some(rcc::PllRDiv::DIV2),
-    });
-    config.sys = rcc::Sysclk::PLL1_R;
-    config.boost = true;
-    config.mux.fdcansel = mux::Fdcansel::PLL1_Q;
-    config.mux.adc12sel = mux::Adcsel::SYS;
-    config
-}
 
 fn now() -> u64 {
     Instant::now().as_micros()
@@ -109,13 +84,12 @@ fn now() -> u64 {
 
 #[embassy_executor::main]
 async fn main(_spawner: Spawner) -> ! {
-    let mut config = embassy_stm32::Config::default();
-    config.rcc = clocks();
-    let p = embassy_stm32::init(config);
-    let mut watchdog = Watchdog::new(p.IWDG, WATCHDOG_US);
-    watchdog.unleash();
-    fail::prepare();
+    let Board { peripherals: p, mut watchdog, crystal } = board::start();
     let mut light = Output::new(p.PB10, Level::Low, Speed::Low);
+    if !crystal {
+        // CAN-FD needs a better clock: other modules' frames would suffer.
+        refuse(3, None, &mut light, &mut watchdog).await
+    }
 
     let mut storage = Storage::new(p.FLASH);
     let page = match read_page(&mut storage) {
@@ -193,7 +167,6 @@ async fn run(
     let mut deadline = Instant::now();
     let mut sample_at = Instant::now();
     let mut sampled_at = Instant::now();
-    let mut enabled = false;
     let mut loops = 0;
     loop {
         let received = with_deadline(deadline.min(sample_at), can.receive()).await.ok();
@@ -204,21 +177,15 @@ async fn run(
             sample_at = moment + SAMPLE;
             let seconds = (moment - sampled_at).as_micros() as f32 * 1e-6;
             sampled_at = moment;
-            // A motor that was cut off has no torque that anybody knows: the sample is not plausible, the controller reports fault 39.
-            let torque = core::array::from_fn::<_, AXES, _>(|axis| match drive.trip[axis] {
-                Some(_) => f32::NAN,
-                None => drive.torque[axis] / torque_limit,
-            });
-            sensors = sense.sample(seconds, torque);
+            sensors = sense.sample(seconds, drive.torque.map(|torque| torque / torque_limit));
             log_trouble(&drive, sense);
         }
+        controller.set_power(drive.power());
         let outputs = controller.poll(now(), &sensors, received.as_ref(), can.status());
         drive::command(drive::Command {
             torque: outputs.motors_enabled.then_some(outputs.torque),
-            // Who relaxes the motors and allows them again (release after an emergency stop) gives a motor that was cut off another chance.
-            rearm: outputs.motors_enabled && !enabled,
+            rearm: controller.rearm(),
         });
-        enabled = outputs.motors_enabled;
         deadline = Instant::from_micros(outputs.deadline);
         can.send(|| controller.next_frame());
         if drive.loops != loops {

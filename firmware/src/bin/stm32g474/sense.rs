@@ -20,8 +20,8 @@ use embassy_stm32::time::Hertz;
 use embassy_time::{Delay, Duration, Instant};
 use embedded_hal_bus::spi::{ExclusiveDevice, RefCellDevice};
 
-/// Full scale of the ADC.
-pub const ADC_RANGE: f32 = 4095.0;
+use crate::board::ADC_RANGE;
+
 /// Both kinds of chip allow 10 MHz; the prescaler makes 5.3 MHz of this.
 const SPI_CLOCK: Hertz = Hertz(6_000_000);
 const THERMISTOR: Thermistor = Thermistor { nominal: 10e3, beta: 3435.0, pull_up: 10e3 };
