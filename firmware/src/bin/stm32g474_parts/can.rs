@@ -16,6 +16,7 @@ mod flash;
 
 use composer_firmware::controller::FIRMWARE_VERSION;
 use composer_firmware::failsafe::{BusOffPolicy, BusStatus};
+use composer_firmware::storage::read_page;
 use composer_shared::wire::{Health, Heartbeat, Message, Mode, NOBODY, PROTOCOL_VERSION};
 use defmt_rtt as _;
 use embassy_executor::Spawner;
@@ -25,6 +26,7 @@ use embassy_time::{Duration, Instant, Timer, with_timeout};
 
 use board::Board;
 use can::CanPort;
+use flash::Storage;
 
 bind_interrupts!(struct Irqs {
     FDCAN1_IT0 => embassy_stm32::can::IT0InterruptHandler<FDCAN1>;
@@ -45,7 +47,7 @@ async fn main(_spawner: Spawner) -> ! {
         watchdog.pet();
         Timer::after(PATIENCE).await;
     }
-    let node = flash::node_page().ok().map(|page| page.node);
+    let node = read_page(&mut Storage::new(p.FLASH)).ok().map(|page| page.node);
     match node {
         Some(node) => defmt::info!("module {=u8}", node),
         None => defmt::warn!("no node page: listening only"),

@@ -19,6 +19,7 @@ use core::cell::RefCell;
 
 use composer_firmware::drivers::encoder::As5047p;
 use composer_firmware::node_page::Calibration;
+use composer_firmware::storage::read_page;
 use composer_shared::robot::MAX_JOINTS;
 use defmt_rtt as _;
 use embassy_executor::Spawner;
@@ -29,13 +30,14 @@ use embassy_time::{Delay, Instant, Timer};
 use embedded_hal_bus::spi::RefCellDevice;
 
 use board::Board;
+use flash::Storage;
 
 defmt::timestamp!("{=u64:us}", Instant::now().as_micros());
 
 #[embassy_executor::main]
 async fn main(_spawner: Spawner) -> ! {
     let Board { peripherals: p, mut watchdog, .. } = board::start();
-    let calibration = flash::node_page().map_or(Calibration::NOMINAL, |page| page.calibration);
+    let calibration = read_page(&mut Storage::new(p.FLASH)).map_or(Calibration::NOMINAL, |page| page.calibration);
     let bus = RefCell::new(Spi::new_blocking(p.SPI1, p.PA5, p.PA7, p.PA6, sense::spi_config(MODE_1)));
     let selects: [Peri<'static, AnyPin>; MAX_JOINTS] = [p.PC6.into(), p.PC7.into(), p.PC8.into(), p.PC9.into()];
     let mut encoders = selects.map(|pin| {

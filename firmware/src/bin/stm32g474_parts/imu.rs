@@ -18,6 +18,7 @@ mod sense;
 use composer_firmware::attitude::Attitude;
 use composer_firmware::drivers::imu::Lsm6dso;
 use composer_firmware::node_page::Calibration;
+use composer_firmware::storage::read_page;
 use defmt_rtt as _;
 use embassy_executor::Spawner;
 use embassy_stm32::gpio::{Level, Output, Speed};
@@ -26,6 +27,7 @@ use embassy_time::{Delay, Duration, Instant, Timer};
 use embedded_hal_bus::spi::ExclusiveDevice;
 
 use board::Board;
+use flash::Storage;
 
 defmt::timestamp!("{=u64:us}", Instant::now().as_micros());
 
@@ -39,7 +41,7 @@ const LOST: u32 = 100;
 #[embassy_executor::main]
 async fn main(_spawner: Spawner) -> ! {
     let Board { peripherals: p, mut watchdog, .. } = board::start();
-    let calibration = flash::node_page().map_or(Calibration::NOMINAL, |page| page.calibration);
+    let calibration = read_page(&mut Storage::new(p.FLASH)).map_or(Calibration::NOMINAL, |page| page.calibration);
     let bus = Spi::new_blocking(p.SPI3, p.PC10, p.PC12, p.PC11, sense::spi_config(MODE_3));
     // Setting a pin cannot fail here.
     let Ok(device) = ExclusiveDevice::new(bus, Output::new(p.PD2, Level::High, Speed::Medium), Delay);

@@ -18,6 +18,7 @@ mod flash;
 use composer_firmware::node_page::Calibration;
 use composer_firmware::power::PowerWatch;
 use composer_firmware::safety::Safety;
+use composer_firmware::storage::read_page;
 use composer_firmware::supply::Supply;
 use composer_shared::robot::{AXES, slew};
 use defmt_rtt as _;
@@ -26,6 +27,7 @@ use embassy_stm32::adc::{Adc, AdcConfig};
 use embassy_time::{Duration, Instant, Timer};
 
 use board::Board;
+use flash::Storage;
 
 defmt::timestamp!("{=u64:us}", Instant::now().as_micros());
 
@@ -41,7 +43,7 @@ const PART: f32 = 0.1;
 #[embassy_executor::main]
 async fn main(_spawner: Spawner) -> ! {
     let Board { peripherals: p, mut watchdog, .. } = board::start();
-    let page = flash::node_page().ok();
+    let page = read_page(&mut Storage::new(p.FLASH)).ok();
     let (calibration, safety) =
         page.map_or((Calibration::NOMINAL, Safety::BOARD), |page| (page.calibration, page.safety));
     // Both converters before either is set up further: they share a reset.
