@@ -60,7 +60,7 @@ pub struct Panel {
     pub series: Vec<Series>,
 }
 
-/// An attention matrix at one time.
+/// A matrix of modules by modules: attention at one time, success with two of them broken.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Heatmap {
     /// Above the matrix, such as "t = 30".
@@ -69,6 +69,19 @@ pub struct Heatmap {
     pub modules: usize,
     /// Row-major weights, 0 to 1; entries that are missing count as 0.
     pub weights: Vec<f32>,
+}
+
+/// What stands around matrices.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct MapWords {
+    /// Above all of them.
+    pub title: String,
+    /// What the columns are, and the rows.
+    pub columns: String,
+    /// See `columns`.
+    pub rows: String,
+    /// The value at the upper end of the scale; none: the largest there is.
+    pub largest: Option<f64>,
 }
 
 /// Mean and standard error over runs (seeds), at the points of `grid`, as a curve without a name.
@@ -233,8 +246,8 @@ fn draw_panel(svg: &mut Svg, panel: &Panel, left: f64, index: usize) {
     svg.text(x, y, "middle", &format!(r#" transform="rotate(-90 {x:.1} {y:.1})""#), &panel.axes.y_label);
 }
 
-/// Attention matrices side by side on one colour scale: the paper's attention figure (section IV-D). Rows attend to columns.
-pub fn heatmaps(maps: &[Heatmap], title: &str) -> String {
+/// Matrices side by side on one colour scale, as in the paper's attention figure (section IV-D).
+pub fn heatmaps(maps: &[Heatmap], words: &MapWords) -> String {
     let (cells, gap, left, top) = (176.0, 26.0, 58.0, 64.0);
     let width = left + maps.len().max(1) as f64 * (cells + gap) + 64.0;
     let height = top + cells + 46.0;
@@ -242,8 +255,8 @@ pub fn heatmaps(maps: &[Heatmap], title: &str) -> String {
     let weight =
         |m: &Heatmap, i: usize| m.weights.get(i).map_or(0.0, |w| if w.is_finite() { f64::from(*w) } else { 0.0 });
     let largest = maps.iter().flat_map(|m| (0..m.modules * m.modules).map(|i| weight(m, i))).fold(0.0, f64::max);
-    let top_value = if largest > 0.0 { largest } else { 1.0 };
-    svg.text(width / 2.0, 22.0, "middle", r#" font-weight="bold" font-size="14""#, title);
+    let top_value = words.largest.unwrap_or(if largest > 0.0 { largest } else { 1.0 });
+    svg.text(width / 2.0, 22.0, "middle", r#" font-weight="bold" font-size="14""#, &words.title);
     for (k, map) in maps.iter().enumerate() {
         let n = map.modules.max(1);
         let (x0, cell) = (left + k as f64 * (cells + gap), cells / n as f64);
@@ -267,10 +280,10 @@ pub fn heatmaps(maps: &[Heatmap], title: &str) -> String {
                 }
             }
         }
-        svg.text(x0 + cells / 2.0, top + cells + 35.0, "middle", "", "module attended to");
+        svg.text(x0 + cells / 2.0, top + cells + 35.0, "middle", "", &words.columns);
     }
     let (x, y) = (20.0, top + cells / 2.0);
-    svg.text(x, y, "middle", &format!(r#" transform="rotate(-90 {x:.1} {y:.1})""#), "attending module");
+    svg.text(x, y, "middle", &format!(r#" transform="rotate(-90 {x:.1} {y:.1})""#), &words.rows);
     let x = left + maps.len().max(1) as f64 * (cells + gap) - 6.0;
     for i in 0..64 {
         svg.add(format_args!(
@@ -424,8 +437,8 @@ mod tests {
             learning_curves(&[curve], &axes),
             panels(&[empty, same]),
             panels(&[]),
-            heatmaps(&maps, "goal-reaching"),
-            heatmaps(&[], ""),
+            heatmaps(&maps, &MapWords { title: "goal-reaching".into(), ..MapWords::default() }),
+            heatmaps(&[], &MapWords::default()),
         ] {
             assert!(svg.starts_with("<svg ") && svg.ends_with("</svg>\n"));
             assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
@@ -449,7 +462,7 @@ mod tests {
             Heatmap { title: String::new(), modules: 1, weights: vec![0.25] },
             Heatmap { title: String::new(), modules: 1, weights: vec![0.5] },
         ];
-        let svg = heatmaps(&maps, "");
+        let svg = heatmaps(&maps, &MapWords::default());
         assert!(svg.contains(&viridis(0.5)) && svg.contains(&viridis(1.0)) && svg.contains("0.50"));
         assert_eq!((viridis(0.0).as_str(), viridis(1.0).as_str()), ("#440154", "#fde725"));
     }

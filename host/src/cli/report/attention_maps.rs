@@ -9,7 +9,7 @@ use crate::env::SnakeEnv;
 use crate::environment::{Environment, View};
 use crate::eval::{DEFAULT_SEED, episode_seed};
 use crate::files::write_whole;
-use crate::plot::{Heatmap, heatmaps};
+use crate::plot::{Heatmap, MapWords, heatmaps};
 use crate::policy::Policy;
 use crate::run::RunConfig;
 
@@ -32,8 +32,13 @@ pub fn write(config: &RunConfig, policy: &dyn Policy, path: &Path) -> Result<()>
                 weights: matrices[step].clone(),
             }
         });
-        let title = format!("{}: attention in a successful episode", config.task.name.title());
-        return write_whole(path, heatmaps(&maps.collect::<Vec<_>>(), &title).as_bytes());
+        let words = MapWords {
+            title: format!("{}: attention in a successful episode", config.task.name.title()),
+            columns: "module attended to".into(),
+            rows: "attending module".into(),
+            largest: None,
+        };
+        return write_whole(path, heatmaps(&maps.collect::<Vec<_>>(), &words).as_bytes());
     }
     eprintln!("note: {} succeeded in none of {TRIED} episodes, so there is no attention figure", config.task.name);
     Ok(())

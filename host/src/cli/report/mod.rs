@@ -1,6 +1,7 @@
 //! `snakectl report`: the published comparisons, from nothing. Killed, it goes on where it was; what is done is skipped.
 
 mod attention_maps;
+mod faults;
 mod physics;
 mod policies;
 mod robustness;
@@ -52,6 +53,8 @@ enum Which {
     Physics(physics::Arguments),
     /// The policies that ship on other physics: a finer step, another solver, other friction, mass and stiffness.
     Robustness(robustness::Arguments),
+    /// The policies that ship with every module broken, and every pair: success as a map.
+    Faults(faults::Arguments),
 }
 
 /// Arguments of a comparison of methods.
@@ -161,6 +164,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         Which::Policies(arguments) => policies::run(arguments),
         Which::Physics(arguments) => physics::run(arguments),
         Which::Robustness(arguments) => robustness::run(arguments),
+        Which::Faults(arguments) => faults::run(arguments),
     }
 }
 
