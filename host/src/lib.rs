@@ -20,6 +20,7 @@ pub mod recorder;
 pub mod replay;
 pub mod robot;
 pub mod run;
+pub mod scenario;
 pub mod sil;
 pub mod sim;
 pub mod stats;

@@ -198,7 +198,7 @@ fn quaternion([x, y, z, w]: [f32; 4]) -> String {
 }
 
 /// Text in an attribute.
-fn escaped(text: &str) -> String {
+pub(crate) fn escaped(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {
         match c {

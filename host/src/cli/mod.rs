@@ -13,6 +13,7 @@ mod physics;
 mod policy_file;
 mod report;
 mod sil;
+mod test;
 mod train;
 
 use std::process::ExitCode;
@@ -43,6 +44,8 @@ enum Verb {
     Export(export::Arguments),
     /// Run complete controllers with a frozen policy on a simulated CAN bus.
     Sil(sil::Arguments),
+    /// Run scenarios on the simulated bus: faults, and what is expected of the robot, as data.
+    Test(test::Arguments),
     /// Make a published comparison from nothing: figure, table, data.
     Report(report::Arguments),
     /// Measure the speed of physics, training and bus on this machine.
@@ -83,6 +86,7 @@ pub fn main() -> ExitCode {
         Some(Verb::Eval(arguments)) => eval::run(&arguments),
         Some(Verb::Export(arguments)) => export::run(&arguments),
         Some(Verb::Sil(arguments)) => sil::run(&arguments),
+        Some(Verb::Test(arguments)) => test::run(&arguments),
         Some(Verb::Report(arguments)) => report::run(&arguments),
         Some(Verb::Bench(arguments)) => bench::run(&arguments),
         Some(Verb::Flash(arguments)) => flash::run(&arguments),

@@ -75,7 +75,7 @@ pub struct Emulation {
 
 impl Emulation {
     /// The emulated modules, tried out; none if they are not asked for.
-    fn launcher(&self, image: &[u8]) -> Result<Option<Qemu>> {
+    pub fn launcher(&self, image: &[u8]) -> Result<Option<Qemu>> {
         if !self.qemu {
             return Ok(None);
         }

@@ -1,0 +1,66 @@
+//! The suite of scenarios that ships holds, and a scenario that does not is seen, named and shown again.
+
+mod common;
+
+use std::path::Path;
+use std::process::Command;
+
+use common::{refuse, snakectl, succeed};
+
+/// What Python's XML parser makes of a JUnit file: tests, failures, and the messages of the failures.
+fn read_back(file: &Path) -> serde_json::Value {
+    let program = "import json, sys, xml.etree.ElementTree as t\n\
+                   r = t.parse(sys.argv[1]).getroot()\n\
+                   print(json.dumps([int(r.get('tests')), int(r.get('failures')), [c.get('name') for c in r.iter('testcase')], \
+                   [f.get('message') for f in r.iter('failure')]]))";
+    let output = Command::new("python3").arg("-c").arg(program).arg(file).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+#[test]
+fn the_suite_that_ships_holds() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let junit = folder.path().join("junit.xml");
+    let text = succeed(root, &["test", "--junit", junit.to_str().unwrap()]);
+    let scenarios = std::fs::read_dir(root.join("tests/scenarios")).unwrap().count();
+    assert!(text.contains(&format!("{scenarios} scenarios hold")), "{text}");
+    let junit = read_back(&junit);
+    assert_eq!((junit[0].as_u64(), junit[1].as_u64()), (Some(scenarios as u64), Some(0)));
+}
+
+#[test]
+fn a_broken_scenario_fails_is_written_down_and_shown_again_by_the_command_it_names() {
+    let folder = tempfile::tempdir().unwrap();
+    let red = "about = \"A <red> one\"\ntask = \"goal-reaching\"\nepisodes = 3\nfaults = \"unplug:#3@0.2s\"\n[expect]\ndead_seen_within = 0\nsuccess_rate = 0.1\n";
+    let green = red.replace("dead_seen_within = 0", "dead_seen_within = 4");
+    std::fs::write(folder.path().join("red.toml"), red).unwrap();
+    std::fs::write(folder.path().join("green.toml"), green).unwrap();
+    let output = snakectl(folder.path(), &["test", ".", "--junit", "junit.xml"]);
+    let text = String::from_utf8(output.stdout).unwrap();
+    assert!(!output.status.success());
+    assert!(String::from_utf8(output.stderr).unwrap().contains("1 of 2 scenarios are broken"));
+    let again = text.split("(snakectl ").nth(1).and_then(|rest| rest.split(')').next()).unwrap();
+    assert!(again.starts_with("test ./red.toml --episode "), "{text}");
+    let output = snakectl(folder.path(), &again.split(' ').collect::<Vec<_>>());
+    let shown = String::from_utf8(output.stdout).unwrap();
+    let complaint = |text: &str| text.lines().find(|line| line.contains("dead_seen_within")).unwrap().to_string();
+    assert_eq!(complaint(&shown), complaint(&text));
+    let junit = read_back(&folder.path().join("junit.xml"));
+    assert_eq!((junit[0].as_u64(), junit[1].as_u64()), (Some(2), Some(1)));
+    assert!(junit[3][0].as_str().unwrap().contains("believes module 3 alive"), "{junit}");
+}
+
+#[test]
+fn files_that_are_no_scenarios_are_refused_before_anything_runs() {
+    let folder = tempfile::tempdir().unwrap();
+    refuse(folder.path(), &["test", "."], &["no scenarios in ."]);
+    refuse(folder.path(), &["test", "missing.toml"], &["cannot read the scenario missing.toml"]);
+    std::fs::write(
+        folder.path().join("a.toml"),
+        "about = \"x\"\ntask = \"goal-reaching\"\ncolour = 1\n[expect]\nlink_speed = 1.0\n",
+    )
+    .unwrap();
+    refuse(folder.path(), &["test", "a.toml"], &["a.toml cannot be", "unknown field `colour`"]);
+}
