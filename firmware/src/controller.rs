@@ -21,10 +21,19 @@
 //! A SYNC that got lost on its way to one module costs nothing: if a neighbour's frame of the next cycle is here when the
 //! cycle is overdue, the module starts it too.
 //!
+//! A SYNC that would move the cycle to quite another number comes from the other part of a cable that was mended, or it is a frame of the past. The
+//! former goes on: the second one in a row is believed.
+//!
 //! # Joining
 //!
-//! A module listens for one period after power-up before it sends anything. If its number is already taken it hears so, and falls
-//! silent without having disturbed the robot.
+//! A module listens for one period after power-up before it sends anything. If its number is already taken it hears so, listens on until that
+//! is certain ([`crate::conflict`]), and falls silent without having disturbed the robot.
+//!
+//! # Arming and emergency stop
+//!
+//! A module takes part in the control cycle from the start, but moves only when the station has armed it; [`crate::failsafe`] has the state diagram.
+//! A stopped module repeats EMERGENCY_STOP every [`REPORT_EVERY`] periods, and the counter in every STATE, LATENT and HEARTBEAT brings the newest stop or
+//! release to whoever missed it.
 //!
 //! # Goal
 //!
@@ -43,12 +52,15 @@ use composer_shared::observation::{POINTS, Sensors, Told, observe, place};
 use composer_shared::policy::{Encoded, GoalKnownTo, Policy};
 use composer_shared::robot::{AXES, Limits, ROOM};
 use composer_shared::wire::{
-    EmergencyStop, FRAGMENTS, Frame, Goal, Health, Heartbeat, LatentMessage, Message, Mode, NOBODY, PROTOCOL_VERSION,
-    STATION, State, StopCommand, StopCount, Sync, Telemetry, quantise_angle,
+    Clearing, EmergencyStop, FRAGMENTS, Frame, Goal, Health, Heartbeat, LatentMessage, Message, Mode, NOBODY,
+    Operation, PROTOCOL_VERSION, STATION, ServiceCode, ServiceRequest, ServiceResponse, State, StopCommand, StopCount,
+    Sync, Telemetry, quantise_angle,
 };
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
+pub use crate::boot::{Boot, ResetCause, Retained};
+use crate::conflict::Conflict;
 use crate::failsafe::Failsafe;
 pub use crate::failsafe::{BusOffPolicy, BusStatus, Fault, FaultSet, LimitedBy};
 use crate::neighbours::{Heard, Neighbours, bit};
@@ -63,6 +75,18 @@ pub const FIRMWARE_VERSION: u8 = 0x01;
 
 /// Cycles between two TELEMETRY frames, and between two HEARTBEAT frames.
 pub const REPORT_EVERY: u16 = 10;
+
+/// Periods between two HEARTBEAT frames of a module that fell silent because its number is taken.
+const SILENT_REPORT_EVERY: u8 = 40;
+
+/// How far ahead a SYNC may be to be believed at once; more than the cycles that pass until somebody takes the time over.
+const SYNC_AHEAD: i16 = 8;
+
+/// Time between two steps of the torque in a jog.
+const JOG_STEP_US: u64 = 2_000;
+
+/// Answers that may wait to be sent.
+const ANSWERS: usize = 4;
 
 /// Cycles for which a module must find itself the live one nearest the head before it takes the time over.
 const CLAIM_AFTER: u8 = 3;
@@ -95,6 +119,8 @@ pub struct Timing {
     pub isolated_after: u8,
     /// Periods without SYNC after which a module relaxes its motors.
     pub sync_lost_after: u8,
+    /// A poll is asked for at least so often, whether something is due or not.
+    pub poll_within_us: u32,
     /// How much later than promised a poll may come before the watchdog latches.
     pub poll_grace_us: u32,
     /// Cycles for which a point of the scene holds when no new one comes.
@@ -118,9 +144,16 @@ impl Timing {
             dead_after: composer_shared::robot::DEAD_AFTER,
             isolated_after: 20,
             sync_lost_after: 4,
+            poll_within_us: period_us,
             poll_grace_us: period_us,
             goal_memory: 4,
         }
+    }
+
+    /// The same for a board whose hardware watchdog resets it after `watchdog_us`: a late poll is noticed, and fault 33 latched, well before.
+    #[must_use]
+    pub fn watched_by(self, watchdog_us: u32) -> Self {
+        Timing { poll_within_us: (watchdog_us / 10).max(1), poll_grace_us: (watchdog_us / 5 * 3).max(1), ..self }
     }
 
     /// About how long SYNC, `points` GOAL frames and the STATE and LATENT frames of all modules occupy the bus in one cycle, with
@@ -187,6 +220,7 @@ impl Config {
             ("dead_after", u32::from(t.dead_after)),
             ("isolated_after", u32::from(t.isolated_after)),
             ("sync_lost_after", u32::from(t.sync_lost_after)),
+            ("poll_within_us", t.poll_within_us),
             ("poll_grace_us", t.poll_grace_us),
         ];
         counts.into_iter().find(|(_, n)| *n == 0).map_or(Ok(()), |(field, _)| Err(ConfigError::Zero(field)))
@@ -299,14 +333,55 @@ enum Phase {
 /// Frames waiting to be sent, one slot each: a newer one replaces an older one that never got onto the bus.
 #[derive(Clone, Debug, Default)]
 struct Outbox {
-    stop: Option<EmergencyStop>,
+    /// With this reason.
+    stop: Option<u8>,
     sync: Option<Sync>,
     state: Option<State>,
     latent: Option<LatentMessage>,
     /// Pieces of the latent already sent (classic bus).
     pieces_sent: u8,
+    /// Answers to the station, oldest first, without gaps.
+    answers: [Option<ServiceResponse>; ANSWERS],
     telemetry: Option<Telemetry>,
     heartbeat: Option<Heartbeat>,
+}
+
+impl Outbox {
+    /// One more answer; the oldest is lost if too many wait.
+    fn answer(&mut self, answer: ServiceResponse) {
+        if self.answers.iter().all(Option::is_some) {
+            self.answers.rotate_left(1);
+            self.answers[ANSWERS - 1] = None;
+        }
+        if let Some(slot) = self.answers.iter_mut().find(|slot| slot.is_none()) {
+            *slot = Some(answer);
+        }
+    }
+
+    fn next_answer(&mut self) -> Option<ServiceResponse> {
+        let first = self.answers[0].take();
+        self.answers.rotate_left(1);
+        first
+    }
+}
+
+/// One axis moves as the station asks.
+#[derive(Clone, Copy, Debug)]
+struct Jog {
+    axis: usize,
+    torque: f32,
+    /// When it ends.
+    until: Micros,
+    /// When the torque was last stepped.
+    stepped: Micros,
+}
+
+/// A SYNC that would move the cycle to quite another number.
+#[derive(Clone, Copy, Debug)]
+struct Candidate {
+    from: u8,
+    cycle: u16,
+    at: Micros,
 }
 
 /// What is remembered of one point of the scene.
@@ -362,10 +437,18 @@ pub struct Controller<'a> {
     power_up: Micros,
     /// Nothing is sent in this cycle: the module only listens.
     quiet: bool,
+    /// It has sent something since it began to listen.
+    spoken: bool,
     failsafe: Failsafe,
+    conflict: Conflict,
     neighbours: Neighbours,
     chain: Chain,
     outbox: Outbox,
+    /// When EMERGENCY_STOP is repeated, while stopped.
+    stop_due: Option<Micros>,
+    /// Whether it answers requests itself.
+    serves: bool,
+    jog: Option<Jog>,
 
     time_keeper: Option<u8>,
     /// When SYNC was last heard or sent; power-up before the first.
@@ -374,6 +457,7 @@ pub struct Controller<'a> {
     next_sync: Option<Micros>,
     /// Cycles in which nobody nearer the head was alive.
     nearest_for: u8,
+    candidate: Option<Candidate>,
 
     cycle: u16,
     cycle_start: Option<Micros>,
@@ -385,6 +469,8 @@ pub struct Controller<'a> {
     /// Cycles since the station was heard; saturating.
     station_silent: u8,
     last_heard: Micros,
+    /// When the station was last heard; power-up before the first time.
+    last_station: Micros,
     last_act: Option<Micros>,
 
     torque: [f32; AXES],
@@ -404,8 +490,8 @@ pub fn relax_factor(period_us: u32, relax_seconds: f32) -> f32 {
 }
 
 impl<'a> Controller<'a> {
-    /// A module that was switched on at `now`. It listens, and starts the clock itself if nobody else does.
-    pub fn new(config: Config, policy: Policy<'a>, now: Micros) -> Result<Self, ConfigError> {
+    /// A module that started at `now`, and how. It listens, starts the clock itself if nobody else does, and waits to be armed.
+    pub fn new(config: Config, policy: Policy<'a>, boot: Boot, now: Micros) -> Result<Self, ConfigError> {
         config.check()?;
         let timing = &config.timing;
         let limits = policy.limits();
@@ -415,14 +501,20 @@ impl<'a> Controller<'a> {
             now,
             power_up: now,
             quiet: true,
-            failsafe: Failsafe::new(limits, config.safety, config.bus_off, timing.poll_grace_us),
+            spoken: false,
+            failsafe: Failsafe::new(limits, config.safety, config.bus_off, timing.poll_grace_us, boot),
+            conflict: Conflict::new(now),
             neighbours: Neighbours::new(config.node, config.modules, timing.dead_after, policy.tag()),
             chain: Chain::new(policy.geometry()),
             outbox: Outbox::default(),
+            stop_due: None,
+            serves: true,
+            jog: None,
             time_keeper: None,
             last_sync: now,
             next_sync: None,
             nearest_for: 0,
+            candidate: None,
             cycle: 0,
             cycle_start: None,
             phase: Phase::Done,
@@ -435,6 +527,7 @@ impl<'a> Controller<'a> {
                 .map(|number| PointMemory { number, ..PointMemory::default() }),
             station_silent: 0,
             last_heard: now,
+            last_station: now,
             last_act: None,
             torque: [0.0; AXES],
             enabled: false,
@@ -472,6 +565,7 @@ impl<'a> Controller<'a> {
         self.keep_time(sensors);
         self.supervise();
         self.advance();
+        self.step_jog();
         self.bear();
         self.report();
         let deadline = self.deadline();
@@ -499,13 +593,19 @@ impl<'a> Controller<'a> {
     #[inline(never)] // Like `poll`.
     pub fn next_frame(&mut self) -> Option<Frame> {
         if self.failsafe.silenced() {
-            self.outbox = Outbox::default();
-            return None;
+            // A stop waits for the bus, everything else gets old.
+            let Outbox { stop, heartbeat, .. } = core::mem::take(&mut self.outbox);
+            self.outbox.stop = stop;
+            if self.failsafe.bus_off() {
+                return None;
+            }
+            self.outbox.heartbeat = heartbeat;
         }
         let (node, fd) = (self.config.node, self.config.bus == BusKind::Fd);
         let outbox = &mut self.outbox;
-        let message = if let Some(m) = outbox.stop.take() {
-            Message::EmergencyStop(m)
+        let latch = self.failsafe.stop();
+        let message = if let Some(reason) = outbox.stop.take().filter(|_| latch.stopped()) {
+            Message::EmergencyStop(EmergencyStop::new(StopCommand::Stop, reason, latch.count()))
         } else if let Some(m) = outbox.sync.take() {
             Message::Sync(m)
         } else if let Some(m) = outbox.state.take() {
@@ -521,6 +621,8 @@ impl<'a> Controller<'a> {
                 }
                 Message::LatentFragment(piece)
             }
+        } else if let Some(m) = outbox.next_answer() {
+            Message::ServiceResponse(m)
         } else if let Some(m) = outbox.telemetry.take() {
             Message::Telemetry(m)
         } else {
@@ -529,11 +631,86 @@ impl<'a> Controller<'a> {
         Some(message.emit(node, fd))
     }
 
-    /// Stops the whole robot from here (a button, a supervisor): latched like a stop from the bus, and told to all others.
-    /// The motors relax with the next poll.
-    pub fn emergency_stop(&mut self) {
-        self.failsafe.stop();
-        self.outbox.stop = Some(EmergencyStop::new(StopCommand::Stop, 0, StopCount::UNKNOWN));
+    /// Stops the whole robot from here (a button, a supervisor), for this reason (the number of a fault, 0 if somebody asked for it): latched like a stop
+    /// from the bus, and told to all others, as soon as the bus allows. The motors relax with the next poll. A robot that is stopped stays so.
+    pub fn emergency_stop(&mut self, reason: u8) {
+        if !self.failsafe.stop().stopped() {
+            self.failsafe.command_stop(StopCommand::Stop, StopCount::UNKNOWN);
+            self.outbox.stop = Some(reason);
+        }
+    }
+
+    /// Releases the whole robot from here; the others are told by the counter in STATE. The module stays disarmed.
+    pub fn release(&mut self) {
+        self.failsafe.command_stop(StopCommand::Release, StopCount::UNKNOWN);
+    }
+
+    /// Allows the motors to be driven; `acknowledge`: even after a reset that was not clean. The error is [`ServiceCode::NotArmable`].
+    pub fn arm(&mut self, acknowledge: bool) -> Result<(), ServiceCode> {
+        self.failsafe.arm(acknowledge)?;
+        self.jog = None;
+        Ok(())
+    }
+
+    /// Takes that back. The motors relax with the next poll.
+    pub fn disarm(&mut self) {
+        self.failsafe.disarm();
+        self.jog = None;
+    }
+
+    /// Whether the station has armed it.
+    pub fn armed(&self) -> bool {
+        self.failsafe.armed()
+    }
+
+    /// Ends the latched faults that a person may end ([`Clearing::Clear`]).
+    pub fn clear(&mut self) {
+        self.failsafe.clear(Clearing::Clear);
+        self.failsafe.clear_cut_offs();
+        // It listens before it talks again.
+        self.conflict = Conflict::new(self.now);
+        (self.power_up, self.spoken) = (self.now, false);
+    }
+
+    /// Drives one axis (0 yaw, 1 pitch) with this torque (the robot's torque unit, within its limits and slewed) for `time_us`, while the module is disarmed.
+    /// A torque or time of 0 ends it. Refused while armed, and while a fault forbids arming or relaxes.
+    pub fn jog(&mut self, axis: usize, torque: f32, time_us: u32) -> Result<(), ServiceCode> {
+        if axis >= AXES {
+            return Err(ServiceCode::NoSuchRegister);
+        }
+        if torque.is_nan() || torque.abs() > self.limits.torque {
+            return Err(ServiceCode::OutOfRange);
+        }
+        if self.failsafe.armed() {
+            return Err(ServiceCode::Armed);
+        }
+        if !self.failsafe.fit() || self.faults().meets(FaultSet::FORBIDDING) {
+            return Err(ServiceCode::NotArmable);
+        }
+        let until = self.now.saturating_add(u64::from(time_us));
+        self.jog = (torque != 0.0 && time_us != 0).then_some(Jog { axis, torque, until, stepped: self.now });
+        Ok(())
+    }
+
+    /// Why the module started.
+    pub fn boot(&self) -> &Boot {
+        self.failsafe.boot()
+    }
+
+    /// What the board has to keep for the next start, whenever it changes.
+    pub fn retained(&self) -> Retained {
+        self.failsafe.retained()
+    }
+
+    /// The board is about to reset itself because somebody asked for it: that will have been a clean one.
+    pub fn expect_restart(&mut self) {
+        self.failsafe.expect_restart();
+    }
+
+    /// Somebody else answers the station's requests and calls [`Controller::arm`] and the others; by itself the controller answers ARM, DISARM and CLEAR, and to
+    /// all others that it does not know them.
+    pub fn leave_requests(&mut self) {
+        self.serves = false;
     }
 
     /// The active faults.
@@ -554,8 +731,14 @@ impl<'a> Controller<'a> {
     /// What the module is at.
     pub fn mode(&self) -> Mode {
         let silent = self.now.saturating_sub(self.last_heard);
-        if self.cycle_start.is_none() {
+        if self.failsafe.stop().stopped() {
+            Mode::Stopped
+        } else if self.jog.is_some() {
+            Mode::Service
+        } else if self.cycle_start.is_none() {
             Mode::Boot
+        } else if !self.failsafe.armed() {
+            Mode::Disarmed
         } else if self.failsafe.relaxed() {
             Mode::Relaxed
         } else if self.config.modules > 1 && silent > self.periods(self.config.timing.dead_after) {
@@ -629,9 +812,10 @@ impl<'a> Controller<'a> {
         }
     }
 
-    /// Listen before you talk.
+    /// Listen before you talk; longer if somebody else seems to have the same number.
     fn listening(&self) -> bool {
-        self.now.saturating_sub(self.power_up) < self.period()
+        let suspected = !self.spoken && self.conflict.suspected(self.now, self.periods(3));
+        suspected || self.now.saturating_sub(self.power_up) < self.period()
     }
 
     fn own(&self) -> usize {
@@ -658,7 +842,9 @@ impl<'a> Controller<'a> {
             (Health::EMERGENCY_STOP, faults.contains(Fault::EmergencyStop)),
             (Health::FAULT, !faults.is_empty()),
         ];
-        flags.into_iter().fold(Health(0), |health, (flag, set)| if set { health.with(flag) } else { health })
+        let health =
+            flags.into_iter().fold(Health(0), |health, (flag, set)| if set { health.with(flag) } else { health });
+        health.with_stop_count(self.failsafe.stop().count())
     }
 
     // Receiving
@@ -670,35 +856,33 @@ impl<'a> Controller<'a> {
         let module = frame.module();
         // A stop counts whoever sends it.
         if let Message::EmergencyStop(stop) = message {
-            match stop.command() {
-                StopCommand::Stop => self.failsafe.stop(),
-                StopCommand::Release => self.failsafe.release(),
-            }
+            self.failsafe.command_stop(stop.command(), stop.count());
         }
         if module == self.config.node {
-            self.failsafe.set(Fault::DuplicateNode, true);
-            self.time_keeper = self.time_keeper.filter(|k| *k != module);
-            self.next_sync = None;
-            return;
+            return self.hear_own_number(&message);
         }
         if module != STATION && module >= self.config.modules {
             return up(&mut self.stats.foreign);
         }
         self.last_heard = self.now;
+        if module == STATION {
+            self.last_station = self.now;
+        }
         self.neighbours.hear(module);
         let heard = match message {
-            Message::EmergencyStop(_)
-            | Message::Telemetry(_)
-            | Message::ServiceRequest(_)
-            | Message::ServiceResponse(_) => Heard::Now,
+            Message::EmergencyStop(_) | Message::Telemetry(_) | Message::ServiceResponse(_) => Heard::Now,
+            Message::ServiceRequest(request) => {
+                self.serve(&request);
+                Heard::Now
+            }
             Message::Sync(sync) => self.hear_sync(module, sync, sensors),
             Message::Goal(goal) => self.hear_goal(goal),
             Message::State(state) => {
-                self.inherit_stop(state.health);
+                self.failsafe.hear_stop(state.health);
                 self.neighbours.hear_state(module, state)
             }
             Message::Latent(latent) => {
-                self.inherit_stop(latent.health);
+                self.failsafe.hear_stop(latent.health);
                 self.neighbours.hear_latent(module, &latent)
             }
             Message::LatentFragment(fragment) => match self.neighbours.hear_fragment(module, &fragment) {
@@ -706,8 +890,9 @@ impl<'a> Controller<'a> {
                 Err(_) => return up(&mut self.stats.malformed),
             },
             Message::Heartbeat(heartbeat) => {
-                self.inherit_stop(heartbeat.health);
+                self.failsafe.hear_stop(heartbeat.health);
                 self.neighbours.hear_policy(module, heartbeat.policy);
+                self.neighbours.hear_protocol(module, heartbeat.protocol);
                 Heard::Now
             }
         };
@@ -716,12 +901,43 @@ impl<'a> Controller<'a> {
         }
     }
 
-    /// A module that is plugged in while the robot is stopped must not move either. Only until its first action: later, a neighbour's
-    /// frame from just before the release would stop it again.
-    fn inherit_stop(&mut self, health: Health) {
-        if self.last_act.is_none() && health.has(Health::EMERGENCY_STOP) {
-            self.failsafe.stop();
+    /// Somebody else says something under this module's number, or a frame of its own came back.
+    fn hear_own_number(&mut self, message: &Message) {
+        let low = self.cycle as u8;
+        let near = |cycle: u8| self.cycle_start.is_none() || cycle.wrapping_sub(low).wrapping_add(1) <= 2;
+        let fresh = match message {
+            Message::State(state) => near(state.cycle),
+            Message::Latent(latent) => near(latent.cycle),
+            Message::Sync(sync) => near(sync.cycle as u8),
+            _ => false,
+        };
+        if self.conflict.hear(self.now, self.period(), fresh) {
+            self.failsafe.set(Fault::DuplicateNode, true);
+            self.time_keeper = self.time_keeper.filter(|keeper| *keeper != self.config.node);
+            self.next_sync = None;
         }
+    }
+
+    /// The station asks for something.
+    fn serve(&mut self, request: &ServiceRequest) {
+        if !self.serves || !request.is_for(self.config.node) {
+            return;
+        }
+        let result = match Operation::from_number(request.operation) {
+            Some(Operation::Arm) if request.value > 1 => Err(ServiceCode::OutOfRange),
+            Some(Operation::Arm) => self.arm(request.value == 1),
+            Some(Operation::Disarm) => {
+                self.disarm();
+                Ok(())
+            }
+            Some(Operation::Clear) if self.armed() => Err(ServiceCode::Armed),
+            Some(Operation::Clear) => {
+                self.clear();
+                Ok(())
+            }
+            _ => Err(ServiceCode::UnknownOperation),
+        };
+        self.outbox.answer(request.answer(result.err().unwrap_or(ServiceCode::Ok), 0));
     }
 
     fn hear_sync(&mut self, from: u8, sync: Sync, sensors: &Sensors) -> Heard {
@@ -729,7 +945,8 @@ impl<'a> Controller<'a> {
         let since_start = self.cycle_start.map(|start| self.now.saturating_sub(start));
         let lost = silence > self.period() + self.period() / 2;
         let ahead = sync.cycle.wrapping_sub(self.cycle) as i16;
-        match self.time_keeper {
+        let keeper = self.time_keeper;
+        match keeper {
             // Who is nearer the head keeps the time; this module's own SYNC makes the other one yield.
             Some(keeper) if from > keeper && (keeper == self.config.node || !lost) => return Heard::Stale,
             // A frame that was held up or repeated.
@@ -738,17 +955,37 @@ impl<'a> Controller<'a> {
             Some(keeper) if from == keeper && ahead > 0 && since_start.is_some_and(|t| t < self.period() / 4) => {
                 return Heard::Stale;
             }
+            // The other part of a mended cable goes on with its numbers, a frame of the past does not.
+            Some(_)
+                if !(0..=SYNC_AHEAD).contains(&ahead)
+                    && silence <= self.periods(self.config.timing.sync_lost_after)
+                    && !self.confirmed(from, sync.cycle) =>
+            {
+                return Heard::Stale;
+            }
             _ => {}
         }
         self.time_keeper = Some(from);
         self.next_sync = None;
         self.last_sync = self.now;
+        self.candidate = None;
+        self.failsafe.set(Fault::ModuleCount, sync.modules != self.config.modules);
         // Already in this cycle, by a neighbour's frame or by another time-keeper's SYNC.
         let known = ahead == 0 && since_start.is_some_and(|t| t < self.period() / 4 * 3);
         if !known {
             self.start_cycle(sync.cycle, sensors);
         }
         Heard::Now
+    }
+
+    /// Whether this is the second SYNC of its sender in a row, in time and number.
+    fn confirmed(&mut self, from: u8, cycle: u16) -> bool {
+        let now = Candidate { from, cycle, at: self.now };
+        self.candidate.replace(now).filter(|before| before.from == from).is_some_and(|before| {
+            let cycles = u64::from(cycle.wrapping_sub(before.cycle));
+            let late = self.now.saturating_sub(before.at).abs_diff(cycles * self.period());
+            (1..=3).contains(&cycles) && late < self.period() / 4
+        })
     }
 
     fn hear_goal(&mut self, goal: Goal) -> Heard {
@@ -766,7 +1003,7 @@ impl<'a> Controller<'a> {
     // Keeping time
 
     fn keep_time(&mut self, sensors: &Sensors) {
-        if self.failsafe.faults().contains(Fault::DuplicateNode) {
+        if self.failsafe.faults().contains(Fault::DuplicateNode) || self.listening() {
             return;
         }
         let now = self.now;
@@ -813,6 +1050,8 @@ impl<'a> Controller<'a> {
 
     fn send_sync(&mut self, cycle: u16, sensors: &Sensors) {
         self.last_sync = self.now;
+        self.spoken = true;
+        self.failsafe.set(Fault::ModuleCount, false);
         self.outbox.sync = Some(Sync::new(cycle, self.alive_count(), self.config.modules));
         self.start_cycle(cycle, sensors);
     }
@@ -846,6 +1085,7 @@ impl<'a> Controller<'a> {
         self.failsafe.check_sample(sensors);
         self.neighbours.start(low);
         self.failsafe.set(Fault::PolicyMismatch, self.neighbours.mismatch() != 0);
+        self.failsafe.set(Fault::ProtocolVersion, self.neighbours.foreign_protocol() != 0);
         up(&mut self.stats.cycles);
 
         self.station_silent = self.station_silent.saturating_add(1);
@@ -865,6 +1105,7 @@ impl<'a> Controller<'a> {
         if self.quiet {
             return;
         }
+        self.spoken = true;
         self.outbox.state = Some(State::new(low, self.health(), &sensors.joint_angles));
         if cycle.wrapping_add(u16::from(self.config.node)) % REPORT_EVERY == 0 {
             self.outbox.telemetry = Some(self.telemetry());
@@ -945,11 +1186,9 @@ impl<'a> Controller<'a> {
         self.used = if self.policy.attention() { self.neighbours.usable() } else { 0 };
         let (own, latents) = (self.own(), self.neighbours.latents());
         let action = self.policy.act(&encoded, latents, self.used, Some(&mut self.attention), own);
-        // A full period between two actions is the rule and what the policy was trained with; only after a change of time-keeper
-        // can it be much shorter, and then the slew limit must still hold.
+        // As fast as the time since the last action allows; a period at most, which is what the policy was trained with.
         let period = self.period();
-        let elapsed = self.last_act.map_or(period, |last| self.now.saturating_sub(last));
-        let seconds = if elapsed >= period / 4 * 3 { period } else { elapsed } as f32 / 1e6;
+        let seconds = self.last_act.map_or(period, |last| self.now.saturating_sub(last).min(period)) as f32 / 1e6;
         let (torque, limited_by) = self.failsafe.command(self.torque, action, seconds);
         self.torque = torque;
         self.limited_by = limited_by;
@@ -978,22 +1217,68 @@ impl<'a> Controller<'a> {
             && self.now.saturating_sub(self.last_sync) > self.periods(timing.sync_lost_after);
         let silence = self.now.saturating_sub(self.last_heard);
         let isolated = self.config.modules > 1 && silence > self.periods(timing.isolated_after);
+        self.failsafe.check_station(self.now.saturating_sub(self.last_station));
         self.failsafe.set(Fault::SyncLost, sync_lost);
         self.failsafe.set(Fault::Isolated, isolated);
-        if self.failsafe.relaxed() {
+        let jogged = self.jog.is_some() && self.may_jog();
+        if self.failsafe.relaxed() && !jogged {
             self.torque = [0.0; AXES];
             self.enabled = false;
             self.limited_by = LimitedBy::Relaxed;
+            self.jog = None;
         }
     }
 
-    /// Queues a HEARTBEAT: every [`REPORT_EVERY`] periods, and when the faults change, but never more than one a period.
+    fn may_jog(&self) -> bool {
+        !self.failsafe.armed() && self.failsafe.fit() && !self.faults().meets(FaultSet::FORBIDDING)
+    }
+
+    /// Drives the axis that the station wants to move.
+    fn step_jog(&mut self) {
+        let Some(jog) = self.jog else { return };
+        if self.now >= jog.until {
+            self.jog = None;
+            self.torque = [0.0; AXES];
+            self.enabled = false;
+            self.limited_by = LimitedBy::Relaxed;
+            return;
+        }
+        let seconds = self.now.saturating_sub(jog.stepped).min(self.period()) as f32 / 1e6;
+        let mut torque = [0.0; AXES];
+        for (axis, (torque, before)) in torque.iter_mut().zip(self.torque).enumerate() {
+            let wanted = if axis == jog.axis { jog.torque / self.limits.torque } else { 0.0 };
+            *torque = self.failsafe.command_axis(before, wanted, seconds);
+        }
+        self.torque = torque;
+        self.enabled = true;
+        self.limited_by = LimitedBy::Nothing;
+        self.jog = Some(Jog { stepped: self.now, ..jog });
+    }
+
+    /// Queues a HEARTBEAT: every [`REPORT_EVERY`] periods, and when the faults change, but never more than one a period. And a stop
+    /// again and again, each module in its own period.
     fn report(&mut self) {
         if self.listening() {
             return;
         }
+        if !self.failsafe.stop().stopped() {
+            self.stop_due = None;
+        } else if self.stop_due.is_none_or(|due| self.now >= due) {
+            let wait = match self.stop_due {
+                None => 1 + self.config.node % REPORT_EVERY as u8,
+                Some(_) => REPORT_EVERY as u8,
+            };
+            if self.stop_due.is_some() {
+                self.outbox.stop = self.outbox.stop.or(Some(0));
+            }
+            self.stop_due = Some(self.now.saturating_add(self.periods(wait)));
+        }
         let changed = self.faults() != self.faults_told;
-        let wait = if changed { self.period() } else { u64::from(REPORT_EVERY) * self.period() };
+        let wait = match changed {
+            true => self.period(),
+            false if self.failsafe.silenced() => self.periods(SILENT_REPORT_EVERY),
+            false => u64::from(REPORT_EVERY) * self.period(),
+        };
         if self.last_heartbeat.is_none_or(|last| self.now.saturating_sub(last) >= wait) {
             self.last_heartbeat = Some(self.now);
             self.faults_told = self.faults();
@@ -1004,7 +1289,7 @@ impl<'a> Controller<'a> {
     /// The next moment at which something happens without a frame.
     fn deadline(&self) -> Micros {
         let timing = &self.config.timing;
-        let mut deadline = self.now.saturating_add(self.period());
+        let mut deadline = self.now.saturating_add(self.period().min(u64::from(timing.poll_within_us)));
         let mut at = |moment: Micros| {
             if moment > self.now {
                 deadline = deadline.min(moment);
@@ -1026,6 +1311,9 @@ impl<'a> Controller<'a> {
             at(self.last_sync.saturating_add(self.periods(timing.sync_lost_after) + 1));
         }
         at(self.last_heard.saturating_add(self.periods(timing.isolated_after) + 1));
+        if let Some(jog) = &self.jog {
+            at(jog.until.min(self.now.saturating_add(JOG_STEP_US)));
+        }
         // The clock cannot go beyond the end of time; nothing else can make this fail.
         deadline.max(self.now.saturating_add(1))
     }

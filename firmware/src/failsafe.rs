@@ -1,30 +1,63 @@
-//! When the motors relax, and why: numbered faults, limits, the watchdog and the emergency stop.
+//! When the motors relax, and why: arming, the emergency stop, numbered faults, limits and the watchdog.
 //!
-//! A *fault* ([`Fault`], numbers from 32) says that something is wrong; most relax the motors. A *limit* ([`LimitedBy`], numbers
-//! from 96) says that all is well but the policy does not get all the torque it asks for.
+//! # Arming
 //!
-//! | fault | relaxes | set by | cleared by |
-//! |---|---|---|---|
-//! | 32 emergency stop | yes | an EMERGENCY_STOP frame from anybody, or locally | a release from the station |
-//! | 33 watchdog | yes | a poll later than the promised deadline plus its grace | a release, or a restart |
-//! | 34 sync lost | yes | no SYNC for `sync_lost_after` periods | the next SYNC |
-//! | 35 duplicate node | yes, and silent | a frame with the module's own number | a restart |
-//! | 36 policy mismatch | no | a neighbour's latent with another policy tag | that neighbour agreeing or silent |
-//! | 37 over-temperature | yes | a motor above the limit, or a reading that is not a number | 5 degrees below the limit |
-//! | 38 joint angle | the axis, outwards | a joint beyond its limit ([`crate::limits`]), at every poll | the joint within its limit |
-//! | 39 sensors | no | readings that cannot be true | readings that can |
-//! | 40 bus-off | if latched | the CAN controller | recovery, or a restart ([`BusOffPolicy`]) |
-//! | 41 isolated | yes | hearing nobody for `isolated_after` periods | the next frame heard |
-//! | 43 undervoltage | yes | the supply below its threshold ([`crate::supply`]) | a supply that has been good for a tenth of a second |
-//! | 44 overvoltage | yes | the supply above its threshold | likewise |
-//! | 45 over-current | the axis | a motor that its driver cut off ([`crate::trips`]) | a rest; after three cut-offs [`Failsafe::clear_cut_offs`], or a restart |
-//! | 46 outside limit | yes | a joint beyond its limit when it was first read | the joint within its limit |
+//! A module starts *disarmed*: it takes part in the control cycle, and its motors are off. ARM from the station arms it, unless a fault forbids it
+//! ([`Fault::forbids_arming`]). It is disarmed by DISARM, by a stop, and when the station is not heard for [`Safety::dead_man_ms`]. After a reset
+//! that was not clean ([`Boot`]) it has fault 42 and needs ARM with an acknowledgement, once.
+//!
+//! ```text
+//!  boot ----first cycle----> disarmed <----------------------- service
+//!                             |   ^  \___________JOG___________^ |  end of the jog, any fault
+//!                             |   |                              |
+//!                           ARM   DISARM, station lost           |
+//!                             v   |                              |
+//!             fault that relaxes  |                              |
+//!  relaxed <------------------- armed (active; alone, if it hears nobody)
+//!     \______fault gone_________^  |
+//!                                  |
+//!  any of them -- EMERGENCY_STOP, or a neighbour that knows of it --> stopped -- release --> disarmed
+//! ```
+//!
+//! # Emergency stop
+//!
+//! Stops and releases are counted ([`StopLatch`]); the newest wins, wherever it comes from, and of two equal ones the stop. The latch survives bus-off,
+//! a cut cable and a reset ([`Retained`]).
+//!
+//! # Faults and limits
+//!
+//! A *fault* ([`Fault`], numbers from 32) says that something is wrong. What each does to the motors, whether it forbids arming and what clears it stands in one
+//! table, [`Fault::effect`], [`Fault::forbids_arming`] and [`Fault::clearing`], which `wire-format.md` prints and this module obeys. They are set by:
+//!
+//! | fault | set by |
+//! |---|---|
+//! | 32 EmergencyStop | the latch |
+//! | 33 Watchdog | a poll later than the promised deadline plus its grace |
+//! | 34 SyncLost | no SYNC for `sync_lost_after` periods |
+//! | 35 DuplicateNode | frames with the module's own number, in several cycles ([`crate::conflict`]) |
+//! | 36 PolicyMismatch | a neighbour's latent with another policy tag |
+//! | 37 OverTemperature | a motor above the limit, or a reading that is not a number |
+//! | 38 JointAngle | a joint beyond its limit ([`crate::limits`]), at every poll |
+//! | 39 Sensors | readings that cannot be true; relaxes unless [`Safety::blind_relaxes`] says otherwise |
+//! | 40 BusOff | the CAN controller; what follows says [`BusOffPolicy`] |
+//! | 41 Isolated | hearing nobody for `isolated_after` periods |
+//! | 42 Restarted | a reset that was not clean |
+//! | 43 UnderVoltage, 44 OverVoltage | the supply beyond its thresholds ([`crate::supply`]) |
+//! | 45 OverCurrent | a motor that its driver cut off ([`crate::trips`]); it forbids arming, and needs CLEAR, only when it stays off |
+//! | 46 OutsideLimit | a joint beyond its limit when it was first read |
+//! | 47 StationLost | an armed module hearing nothing from the station for [`Safety::dead_man_ms`] |
+//! | 48 ModuleCount | the time-keeper's SYNC with another number of modules |
+//! | 49 ProtocolVersion | a neighbour's HEARTBEAT with another version |
+//!
+//! A *limit* ([`LimitedBy`], numbers from 96) says that all is well but the policy does not get all the torque it asks for.
 
 use composer_shared::observation::Sensors;
 use composer_shared::robot::{AXES, Limits};
+use composer_shared::wire::{Clearing, Effect, Health, ServiceCode, StopCommand, StopCount, StopLatch};
 pub use composer_shared::wire::{Fault, LimitedBy};
 use serde::{Deserialize, Serialize};
 
+use crate::boot::{Boot, Retained};
 use crate::controller::Micros;
 use crate::limits::Joints;
 use crate::power::{Power, PowerWatch};
@@ -42,17 +75,27 @@ impl FaultSet {
     /// None.
     pub const EMPTY: FaultSet = FaultSet(0);
     /// Those that relax the motors. A latched bus-off does too, see [`Failsafe::relaxed`].
-    const RELAXING: FaultSet = FaultSet(
-        bit(Fault::EmergencyStop)
-            | bit(Fault::Watchdog)
-            | bit(Fault::SyncLost)
-            | bit(Fault::DuplicateNode)
-            | bit(Fault::OverTemperature)
-            | bit(Fault::Isolated)
-            | bit(Fault::UnderVoltage)
-            | bit(Fault::OverVoltage)
-            | bit(Fault::OutsideLimit),
-    );
+    pub const RELAXING: FaultSet = {
+        let (mut set, mut i) = (0, 0);
+        while i < Fault::ALL.len() {
+            if matches!(Fault::ALL[i].effect(), Effect::Relaxed | Effect::Disarmed | Effect::Silent) {
+                set |= bit(Fault::ALL[i]);
+            }
+            i += 1;
+        }
+        FaultSet(set)
+    };
+    /// Those that forbid arming.
+    pub const FORBIDDING: FaultSet = {
+        let (mut set, mut i) = (0, 0);
+        while i < Fault::ALL.len() {
+            if Fault::ALL[i].forbids_arming() {
+                set |= bit(Fault::ALL[i]);
+            }
+            i += 1;
+        }
+        FaultSet(set)
+    };
 
     /// Whether `fault` is in it.
     pub const fn contains(self, fault: Fault) -> bool {
@@ -72,6 +115,17 @@ impl FaultSet {
     /// The lowest number, or 0: what HEARTBEAT says.
     pub fn number(self) -> u8 {
         self.iter().next().map_or(0, |f| f as u8)
+    }
+
+    /// Whether the two have one in common.
+    pub const fn meets(self, other: FaultSet) -> bool {
+        self.0 & other.0 != 0
+    }
+
+    /// The same without this one.
+    #[must_use]
+    pub const fn without(self, fault: Fault) -> Self {
+        FaultSet(self.0 & !bit(fault))
     }
 
     fn set(&mut self, fault: Fault, active: bool) {
@@ -110,7 +164,7 @@ pub enum BusOffPolicy {
     Latch,
 }
 
-/// Keeps the faults and applies the limits.
+/// Keeps the faults, the emergency stop and whether the module is armed, and applies the limits.
 #[derive(Clone, Debug)]
 pub struct Failsafe {
     /// The policy's.
@@ -122,13 +176,23 @@ pub struct Failsafe {
     faults: FaultSet,
     joints: Joints,
     power: PowerWatch,
+    stop: StopLatch,
+    armed: bool,
+    boot: Boot,
+    /// Unclean resets that nobody has acknowledged.
+    resets: u8,
+    /// The next reset is one that somebody asked for.
+    commanded: bool,
     /// When the next poll was promised at the latest; none before the first.
     promised: Option<Micros>,
 }
 
 impl Failsafe {
-    /// No faults. `limits` are the policy's. A poll may come `grace_us` later than promised.
-    pub fn new(limits: Limits, safety: Safety, bus_off: BusOffPolicy, grace_us: u32) -> Self {
+    /// Disarmed, and as the start was. `limits` are the policy's. A poll may come `grace_us` later than promised.
+    pub fn new(limits: Limits, safety: Safety, bus_off: BusOffPolicy, grace_us: u32, boot: Boot) -> Self {
+        let mut faults = FaultSet::EMPTY;
+        faults.set(Fault::Restarted, !boot.cause.clean());
+        faults.set(Fault::EmergencyStop, boot.stop.stopped());
         Failsafe {
             joints: Joints::new(safety.joints, limits.joint_angle),
             power: PowerWatch::new(safety.supply),
@@ -136,7 +200,12 @@ impl Failsafe {
             safety,
             bus_off,
             grace_us,
-            faults: FaultSet::EMPTY,
+            faults,
+            stop: boot.stop,
+            armed: false,
+            boot,
+            resets: boot.resets,
+            commanded: false,
             promised: None,
         }
     }
@@ -146,14 +215,68 @@ impl Failsafe {
         self.faults
     }
 
-    /// Whether a fault keeps the motors relaxed.
+    /// Whether the motors are kept relaxed, by a fault or because the module is not armed.
     pub fn relaxed(&self) -> bool {
-        self.faults.0 & FaultSet::RELAXING.0 != 0 || self.bus_off_latched()
+        !self.armed || !self.fit()
     }
 
-    /// Whether the module must not send.
+    /// Whether no fault keeps the motors relaxed.
+    pub fn fit(&self) -> bool {
+        let faults = if self.safety.blind_relaxes { self.faults } else { self.faults.without(Fault::Sensors) };
+        !faults.meets(FaultSet::RELAXING) && !self.bus_off_latched()
+    }
+
+    /// Whether the station has armed the module.
+    pub fn armed(&self) -> bool {
+        self.armed
+    }
+
+    /// The station's ARM. The acknowledgement says that somebody knows of an unclean reset. Refused while a fault forbids it; a module that is armed stays so.
+    pub fn arm(&mut self, acknowledge: bool) -> Result<(), ServiceCode> {
+        if acknowledge {
+            self.resets = 0;
+            self.clear(Clearing::Acknowledgement);
+        }
+        if !self.armed && self.faults.meets(FaultSet::FORBIDDING) {
+            return Err(ServiceCode::NotArmable);
+        }
+        self.armed = true;
+        Ok(())
+    }
+
+    /// Takes the arming back.
+    pub fn disarm(&mut self) {
+        self.armed = false;
+    }
+
+    /// The emergency stop.
+    pub fn stop(&self) -> StopLatch {
+        self.stop
+    }
+
+    /// Why the module started.
+    pub fn boot(&self) -> &Boot {
+        &self.boot
+    }
+
+    /// What to keep for the next start.
+    pub fn retained(&self) -> Retained {
+        Retained { stop: self.stop, resets: self.resets, commanded: self.commanded }
+    }
+
+    /// The next reset is one that somebody asked for.
+    pub fn expect_restart(&mut self) {
+        self.commanded = true;
+    }
+
+    /// Whether the module must not send, whatever else it may say when it is [silent](Effect::Silent).
     pub fn silenced(&self) -> bool {
-        self.faults.contains(Fault::DuplicateNode) || self.faults.contains(Fault::BusOff)
+        self.faults.contains(Fault::DuplicateNode) || self.bus_off()
+    }
+
+    /// Whether the CAN controller is off.
+    pub fn bus_off(&self) -> bool {
+        self.faults.contains(Fault::BusOff)
     }
 
     /// Whether the CAN port may recover from bus-off.
@@ -170,15 +293,46 @@ impl Failsafe {
         self.faults.set(fault, active);
     }
 
-    /// Latches the emergency stop.
-    pub fn stop(&mut self) {
-        self.faults.set(Fault::EmergencyStop, true);
+    /// Takes a stop or a release. A release ends the watchdog's latch, too.
+    pub fn command_stop(&mut self, command: StopCommand, count: StopCount) {
+        let newer = count == StopCount::UNKNOWN || count.newer_than(self.stop.count());
+        self.stop.command(command, count);
+        if command == StopCommand::Release && newer && !self.stop.stopped() {
+            self.clear(Clearing::Release);
+        }
+        self.follow_stop();
     }
 
-    /// The station's release: ends the emergency stop and the watchdog's latch, nothing else.
-    pub fn release(&mut self) {
-        self.faults.set(Fault::EmergencyStop, false);
-        self.faults.set(Fault::Watchdog, false);
+    /// Takes what another module says of itself.
+    pub fn hear_stop(&mut self, health: Health) {
+        if self.stop.hear(health.has(Health::EMERGENCY_STOP), health.stop_count()) {
+            self.follow_stop();
+        }
+    }
+
+    fn follow_stop(&mut self) {
+        self.faults.set(Fault::EmergencyStop, self.stop.stopped());
+        self.armed &= !self.stop.stopped();
+    }
+
+    /// Ends the faults that are ended in this way.
+    pub fn clear(&mut self, by: Clearing) {
+        for fault in Fault::ALL {
+            if fault.clearing() == by {
+                self.faults.set(fault, false);
+            }
+        }
+    }
+
+    /// Follows how long the station has been silent: an armed module does not go on without it.
+    pub fn check_station(&mut self, silence: Micros) {
+        let dead_man = u64::from(self.safety.dead_man_ms) * 1000;
+        if dead_man == 0 || silence <= dead_man {
+            self.faults.set(Fault::StationLost, false);
+        } else if self.armed {
+            self.faults.set(Fault::StationLost, true);
+            self.armed = false;
+        }
     }
 
     /// Latches the watchdog if this poll comes too late.
@@ -245,6 +399,11 @@ impl Failsafe {
         self.faults.set(Fault::Sensors, !sensors.plausible());
     }
 
+    /// The torque of one axis, without anything that relaxes: within the limit and slewed.
+    pub fn command_axis(&self, previous: f32, action: f32, seconds: f32) -> f32 {
+        self.safety.caps.command(&self.limits, previous, action, seconds)
+    }
+
     /// The torques to command for the actions (-1 to 1), `seconds` after the `previous` ones, and what held them back. Zero when relaxed. What of it
     /// the joints bear says [`Failsafe::bearable`].
     pub fn command(&self, previous: [f32; AXES], action: [f32; AXES], seconds: f32) -> ([f32; AXES], LimitedBy) {
@@ -286,7 +445,9 @@ mod tests {
     fn failsafe() -> Failsafe {
         let limits =
             Limits { torque: 80.0, torque_slew: 800.0, joint_angle: 3.1, temperature: 80.0, ..Limits::default() };
-        Failsafe::new(limits, Safety::POLICY, BusOffPolicy::Recover, 1000)
+        let mut failsafe = Failsafe::new(limits, Safety::POLICY, BusOffPolicy::Recover, 1000, Boot::default());
+        failsafe.arm(false).unwrap();
+        failsafe
     }
 
     fn level() -> Sensors {
@@ -320,7 +481,7 @@ mod tests {
         failsafe.check_poll(15_000);
         assert_eq!(failsafe.faults().number(), 33);
         assert!(failsafe.relaxed());
-        failsafe.release();
+        failsafe.command_stop(StopCommand::Release, StopCount::UNKNOWN);
         assert!(!failsafe.relaxed());
     }
 
@@ -345,7 +506,7 @@ mod tests {
         failsafe.bus_off = BusOffPolicy::Latch;
         failsafe.check_bus(BusStatus::BusOff);
         failsafe.check_bus(BusStatus::ErrorActive);
-        failsafe.release();
+        failsafe.command_stop(StopCommand::Release, StopCount::UNKNOWN);
         assert!(failsafe.silenced() && failsafe.relaxed());
         assert_eq!(failsafe.faults().number(), 40);
     }
@@ -367,8 +528,10 @@ mod tests {
         failsafe.check_joints(&level());
         failsafe.check_sample(&Sensors::ZERO);
         assert_eq!(failsafe.faults().number(), 39);
-        assert!(!failsafe.relaxed());
-        failsafe.stop();
+        assert!(failsafe.relaxed(), "a blind module pulls at nothing");
+        failsafe.safety.blind_relaxes = false;
+        assert!(!failsafe.relaxed(), "the paper's observation fault");
+        failsafe.command_stop(StopCommand::Stop, StopCount::UNKNOWN);
         assert_eq!(command(&failsafe, [70.0; 2], [1.0; 2]), ([0.0; 2], LimitedBy::Relaxed));
         assert_eq!(failsafe.faults().iter().map(|f| f as u8).collect::<std::vec::Vec<_>>(), [32, 39]);
     }

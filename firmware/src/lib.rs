@@ -16,10 +16,13 @@
 extern crate std;
 
 pub mod attitude;
+pub mod boot;
 pub mod budget;
+pub mod conflict;
 pub mod controller;
 pub mod drivers;
 pub mod failsafe;
+pub mod light;
 pub mod limits;
 pub mod link;
 pub mod memory_map;
@@ -28,6 +31,7 @@ pub mod node_page;
 pub mod port;
 pub mod power;
 pub mod safety;
+pub mod stop_input;
 pub mod storage;
 pub mod supply;
 pub mod trips;

@@ -34,10 +34,10 @@ use composer_shared::wire::{Frame, Mode};
 use serde::de::{Error as _, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-use crate::controller::{BusStatus, Config, FaultSet, Micros, Stats};
+use crate::controller::{Boot, BusStatus, Config, FaultSet, Micros, Retained, Stats};
 
 /// Version of these messages. The first two numbers of the first message, 0 and this, stay what they are in every version.
-pub const PROTOCOL: u16 = 1;
+pub const PROTOCOL: u16 = 2;
 
 /// Most bytes of an encoded message, framing and the 0 at its end included.
 pub const MESSAGE_MAX: usize = 320;
@@ -58,10 +58,12 @@ pub const BUILD: u64 = match u64::from_str_radix(env!("COMPOSER_CONTROLLER_SOURC
 /// What the simulator says.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum ToModule {
-    /// Power is on: a new controller with this configuration begins at `now`. A module that has one already forgets it.
+    /// Power is on, or a reset is over: a new controller with this configuration begins at `now`. A module that has one already forgets it.
     Start {
         /// Which module of which robot.
         config: Config,
+        /// Why it starts, and what it still knows.
+        boot: Boot,
         /// The module's clock, us.
         now: Micros,
     },
@@ -141,6 +143,8 @@ pub struct Status {
     pub faults: FaultSet,
     /// Its counters.
     pub stats: Stats,
+    /// What it keeps for its next start.
+    pub retained: Retained,
     /// Its attention over the modules.
     pub attention: Weights,
 }

@@ -5,7 +5,7 @@
 
 use composer_shared::policy::Latent;
 use composer_shared::robot::ROOM;
-use composer_shared::wire::{FRAGMENTS, Fragment, Health, LatentMessage, State, WireError};
+use composer_shared::wire::{FRAGMENTS, Fragment, Health, LatentMessage, PROTOCOL_VERSION, State, WireError};
 
 /// What a frame brought.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -48,6 +48,8 @@ pub struct Neighbours {
     /// The latent may be attended to: plausible, and of the same policy.
     usable: u64,
     mismatch: u64,
+    /// Speaks another version of the protocol.
+    foreign_protocol: u64,
     /// Silent without any frame, without STATE, without LATENT.
     silence: Silence,
     silence_state: Silence,
@@ -83,6 +85,7 @@ impl Neighbours {
             latent_next: 0,
             usable: 0,
             mismatch: 0,
+            foreign_protocol: 0,
             silence: Silence::NONE,
             silence_state: Silence::NONE,
             silence_latent: Silence::NONE,
@@ -105,9 +108,10 @@ impl Neighbours {
         (self.state_next, self.latent_next) = (0, 0);
         self.cycle = Some(cycle);
         self.mismatch &= self.alive();
+        self.foreign_protocol &= self.alive();
         for assembly in self.assemblies.iter_mut().take(usize::from(self.modules)) {
-            // Pieces of older cycles must not meet those of a later cycle with the same lower 4 bits.
-            if assembly.cycle4 != cycle & 15 {
+            // Pieces of older cycles must not meet those of a later cycle with the same lower 4 bits, also if the cycle jumps.
+            if assembly.cycle4 != cycle & 15 || !follows {
                 assembly.pieces = 0;
             }
         }
@@ -206,6 +210,21 @@ impl Neighbours {
         } else {
             self.mismatch |= bit;
         }
+    }
+
+    /// Takes note of the version of the protocol that `module` says it speaks.
+    pub fn hear_protocol(&mut self, module: u8, version: u8) {
+        let bit = bit(module) & self.others;
+        if version == PROTOCOL_VERSION {
+            self.foreign_protocol &= !bit;
+        } else {
+            self.foreign_protocol |= bit;
+        }
+    }
+
+    /// Live neighbours that speak another version of the protocol.
+    pub fn foreign_protocol(&self) -> u64 {
+        self.foreign_protocol
     }
 
     /// Neighbours that were heard within the last `dead_after` cycles.

@@ -246,6 +246,7 @@ fn simulated_status(hit: &FaultsNow, module: usize) -> Status {
 pub fn describe(fault: &Fault) -> String {
     match *fault {
         Fault::Unplug(m) => format!("module {m} unplugged"),
+        Fault::BrownOut(m) => format!("supply of module {m} breaks in"),
         Fault::ActuatorDead(m) => format!("module {m}'s motors dead"),
         Fault::SensorZeroed(m) => format!("module {m}'s sensors read zero"),
         Fault::SensorStuck(m) => format!("module {m}'s sensors stuck"),

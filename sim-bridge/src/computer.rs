@@ -1,6 +1,8 @@
 //! What runs the controller of one module: the simulation's own process, or something at the end of a wire.
 
-use composer_firmware::controller::{BusStatus, Config, ConfigError, Controller, FaultSet, Micros, Outputs, Stats};
+use composer_firmware::controller::{
+    Boot, BusStatus, Config, ConfigError, Controller, FaultSet, Micros, Outputs, Retained, Stats,
+};
 use composer_shared::observation::Sensors;
 use composer_shared::policy::Policy;
 use composer_shared::robot::MAX_MODULES;
@@ -63,6 +65,8 @@ pub struct Status<'a> {
     pub faults: FaultSet,
     /// Its counters.
     pub stats: Stats,
+    /// What it keeps for its next start.
+    pub retained: Retained,
 }
 
 /// A computer with a module's controller. Asking is apart from waiting for the answer, so that the computers of several modules can work at the
@@ -92,8 +96,8 @@ pub trait Launcher {
     /// What it switches on.
     type Computer: Computer;
 
-    /// A controller with this configuration begins at `now` of its own clock.
-    fn start(&self, config: Config, now: Micros) -> Result<Self::Computer, Trouble>;
+    /// A controller with this configuration begins at `now` of its own clock, and so did its start come about.
+    fn start(&self, config: Config, boot: Boot, now: Micros) -> Result<Self::Computer, Trouble>;
 }
 
 /// Controllers in this process.
@@ -112,8 +116,8 @@ impl<'a> InProcess<'a> {
 impl<'a> Launcher for InProcess<'a> {
     type Computer = Local<'a>;
 
-    fn start(&self, config: Config, now: Micros) -> Result<Local<'a>, Trouble> {
-        let controller = Controller::new(config, self.policy, now).map_err(Trouble::Config)?;
+    fn start(&self, config: Config, boot: Boot, now: Micros) -> Result<Local<'a>, Trouble> {
+        let controller = Controller::new(config, self.policy, boot, now).map_err(Trouble::Config)?;
         let outputs = Outputs { torque: Default::default(), motors_enabled: false, deadline: now };
         Ok(Local { controller, outputs })
     }
@@ -159,6 +163,7 @@ impl Computer for Local<'_> {
             attention: controller.attention(),
             faults: controller.faults(),
             stats: *controller.stats(),
+            retained: controller.retained(),
         }
     }
 }

@@ -7,6 +7,7 @@
 //! |---|---|
 //! | `none` | nothing |
 //! | `unplug:K` | K modules chosen at random lose power and leave the bus, each at a random time in the first [`FIRST_PART_NS`] |
+//! | `brownout:K` | the supply of K modules breaks in, for [`BROWN_OUT_NS`] if no end is given, each at a random time in the first part; they restart and know it |
 //! | `action:K` | the motors of K modules do nothing, from the start (the paper's action corruption) |
 //! | `observation:K` | the sensors of K modules read zero, from the start (the paper's observation corruption) |
 //! | `stuck:K` | the sensors of K modules keep their last reading, from a random time in the first part on |
@@ -30,6 +31,8 @@ use rand_chacha::ChaCha8Rng;
 
 /// The first part of an episode, in which faults without a given time start, ns.
 pub const FIRST_PART_NS: u64 = 2_000_000_000;
+/// How long a supply breaks in unless told otherwise, ns.
+pub const BROWN_OUT_NS: u64 = 10_000_000;
 /// Identifier that a babbling node floods the bus with, unless told otherwise: more urgent than everything but EMERGENCY_STOP and the
 /// SYNC of the modules.
 pub const BABBLE_ID: u16 = 0x0ff;
@@ -39,7 +42,7 @@ pub const BABBLE_ID: u16 = 0x0ff;
 pub enum FaultError {
     /// The name is none of the known ones.
     #[error(
-        "unknown fault `{0}`; known are unplug, action, observation, stuck, babble, cut, drop, delay, corrupt, duplicate and none"
+        "unknown fault `{0}`; known are unplug, brownout, action, observation, stuck, babble, cut, drop, delay, corrupt, duplicate and none"
     )]
     Unknown(String),
     /// Something is missing or superfluous behind the name.
@@ -99,6 +102,8 @@ impl fmt::Display for Target {
 pub enum FaultKind {
     /// Modules lose power and leave the bus.
     Unplug(Target),
+    /// Their supply breaks in.
+    BrownOut(Target),
     /// Motors do nothing.
     Action(Target),
     /// Sensors read zero.
@@ -123,6 +128,7 @@ impl fmt::Display for FaultKind {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match *self {
             FaultKind::Unplug(target) => write!(f, "unplug:{target}"),
+            FaultKind::BrownOut(target) => write!(f, "brownout:{target}"),
             FaultKind::Action(target) => write!(f, "action:{target}"),
             FaultKind::Observation(target) => write!(f, "observation:{target}"),
             FaultKind::Stuck(target) => write!(f, "stuck:{target}"),
@@ -234,6 +240,7 @@ fn parse_fault(text: &str) -> Result<PlannedFault, FaultError> {
     };
     let kind = match name {
         "unplug" => FaultKind::Unplug(target(argument, "unplug:1")?),
+        "brownout" => FaultKind::BrownOut(target(argument, "brownout:1")?),
         "action" => FaultKind::Action(target(argument, "action:1")?),
         "observation" => FaultKind::Observation(target(argument, "observation:1")?),
         "stuck" => FaultKind::Stuck(target(argument, "stuck:1")?),
@@ -294,6 +301,8 @@ pub fn parse_time(text: &str) -> Result<u64, FaultError> {
 pub enum Fault {
     /// The module loses power and leaves the bus.
     Unplug(usize),
+    /// The module's supply breaks in: it is off, and remembers what outlasts that when it comes back.
+    BrownOut(usize),
     /// The module's motors do nothing.
     ActuatorDead(usize),
     /// The module's sensors read zero.
@@ -321,7 +330,7 @@ impl Fault {
     pub fn module(&self) -> Option<usize> {
         match *self {
             Fault::Unplug(m) | Fault::ActuatorDead(m) | Fault::SensorZeroed(m) | Fault::SensorStuck(m) => Some(m),
-            Fault::Babble(m, _) | Fault::Misread(m, _) => Some(m),
+            Fault::BrownOut(m) | Fault::Babble(m, _) | Fault::Misread(m, _) => Some(m),
             _ => None,
         }
     }
@@ -351,6 +360,7 @@ impl FaultPlan {
         for fault in &self.faults {
             let needed = match fault.kind {
                 FaultKind::Unplug(target)
+                | FaultKind::BrownOut(target)
                 | FaultKind::Action(target)
                 | FaultKind::Observation(target)
                 | FaultKind::Stuck(target)
@@ -387,6 +397,7 @@ impl FaultPlan {
             };
             let (sudden, faults): (bool, Vec<Fault>) = match planned.kind {
                 FaultKind::Unplug(target) => (true, hit(target, &mut rng).into_iter().map(Fault::Unplug).collect()),
+                FaultKind::BrownOut(target) => (true, hit(target, &mut rng).into_iter().map(Fault::BrownOut).collect()),
                 FaultKind::Stuck(target) => (true, hit(target, &mut rng).into_iter().map(Fault::SensorStuck).collect()),
                 FaultKind::Action(target) => {
                     (false, hit(target, &mut rng).into_iter().map(Fault::ActuatorDead).collect())
@@ -414,7 +425,8 @@ impl FaultPlan {
             for fault in faults {
                 let random = if sudden { rng.random_range(0..FIRST_PART_NS) } else { 0 };
                 let at_ns = planned.at_ns.unwrap_or(random);
-                drawn.push(ScheduledFault { at_ns, until_ns: planned.until_ns, fault });
+                let brief = matches!(fault, Fault::BrownOut(_)).then(|| at_ns.saturating_add(BROWN_OUT_NS));
+                drawn.push(ScheduledFault { at_ns, until_ns: planned.until_ns.or(brief), fault });
             }
         }
         drawn.sort_by_key(|fault| fault.at_ns);

@@ -26,7 +26,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
-use composer_firmware::controller::{BusKind, Config, Micros};
+use composer_firmware::controller::{Boot, BusKind, Config, Micros};
 use composer_firmware::link::POLICY_ADDRESS;
 use composer_shared::policy::Policy;
 
@@ -92,7 +92,7 @@ impl Qemu {
 
     /// Boots one module to see what the image is, and ends it.
     pub fn probe(&self, policy: &Policy<'_>) -> Result<Hello, Trouble> {
-        self.start(Config::new(0, 1, BusKind::Fd, policy), 0)?.hello()
+        self.start(Config::new(0, 1, BusKind::Fd, policy), Boot::default(), 0)?.hello()
     }
 
     fn command(&self) -> Command {
@@ -156,9 +156,9 @@ pub type Emulated = Remote<Process>;
 impl Launcher for Qemu {
     type Computer = Emulated;
 
-    fn start(&self, config: Config, now: Micros) -> Result<Emulated, Trouble> {
+    fn start(&self, config: Config, boot: Boot, now: Micros) -> Result<Emulated, Trouble> {
         config.check().map_err(Trouble::Config)?;
-        Ok(Remote::new(self.spawn()?, config, now))
+        Ok(Remote::new(self.spawn()?, config, boot, now))
     }
 }
 

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use composer_firmware::controller::{Config, Micros, Outputs};
+use composer_firmware::controller::{Boot, Config, Micros, Outputs};
 use composer_firmware::link::{
     self, BUILD, Carried, FromModule, LinkError, MESSAGE_MAX, PROTOCOL, Receiver, Sample, ToModule, Weights,
 };
@@ -87,7 +87,7 @@ pub struct Remote<L> {
     /// Received bytes that are not looked at yet.
     ahead: VecDeque<u8>,
     /// What it is to be; taken when it has booted and was told.
-    start: Option<(Config, Micros)>,
+    start: Option<(Config, Boot, Micros)>,
     /// The readings that it knows, by their bytes.
     sensors: Vec<u8>,
     torque: [f32; AXES],
@@ -101,12 +101,12 @@ pub struct Remote<L> {
 
 impl<L: Line> Remote<L> {
     /// What boots at the other end of `line` is to be this module. Does not wait for it.
-    pub fn new(line: L, config: Config, now: Micros) -> Self {
+    pub fn new(line: L, config: Config, boot: Boot, now: Micros) -> Self {
         Remote {
             line,
             receiver: Receiver::default(),
             ahead: VecDeque::new(),
-            start: Some((config, now)),
+            start: Some((config, boot, now)),
             sensors: Vec::new(),
             torque: [0.0; AXES],
             frames: VecDeque::new(),
@@ -120,6 +120,7 @@ impl<L: Line> Remote<L> {
                 heard: 0,
                 faults: Default::default(),
                 stats: Default::default(),
+                retained: Default::default(),
                 attention: Weights { all: [0; MAX_MODULES], modules: 0 },
             },
         }
@@ -148,10 +149,10 @@ impl<L: Line> Remote<L> {
 
     /// Waits until it has booted, the first time, and tells it what it is.
     fn ensure_started(&mut self) -> Result<(), Trouble> {
-        if let Some((config, now)) = self.start {
+        if let Some((config, boot, now)) = self.start {
             self.hello()?;
             self.start = None;
-            self.send(&ToModule::Start { config, now })?;
+            self.send(&ToModule::Start { config, boot, now })?;
         }
         Ok(())
     }
@@ -292,6 +293,7 @@ impl<L: Line> Computer for Remote<L> {
             attention: &status.attention.all,
             faults: status.faults,
             stats: status.stats,
+            retained: status.retained,
         }
     }
 }

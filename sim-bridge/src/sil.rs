@@ -3,14 +3,16 @@
 //! One discrete-event loop in virtual time (ns) joins the plant, which advances in its own steps, one firmware controller a module
 //! ([`run`]: in this process; [`run_on`]: on any [computer](crate::computer)),
 //! the ground station and the [`Bus`] between them. At time 0 the first SYNC is sent: the controllers were switched on so much earlier that the
-//! head takes the time over just then. So control cycle c covers the same time as control step c of an environment without a bus.
+//! head takes the time over just then. So control cycle c covers the same time as control step c of an environment without a bus. The station has armed
+//! them by then; it does so once a second from then on, for those that are plugged in later.
 //!
 //! - Sensors are sampled from the plant's state after its last whole step.
 //! - A torque that a controller has computed at time t acts from the first plant step that begins at t or later, never before.
 //! - Computing takes time: [`SilConfig::encode_latency_us`] from the last STATE needed until LATENT is ready to be sent,
 //!   [`SilConfig::act_latency_us`] from the last LATENT needed until the torque is at the motor. Meanwhile received frames wait.
 //! - Modules and station send and receive through a [`Port`], which is the board's.
-//! - An unplugged module is gone: no controller, no torque from the next plant step on. Plugged in again, a fresh controller starts.
+//! - An unplugged module is gone: no controller, no torque from the next plant step on. Plugged in again, a fresh controller starts. One whose supply broke
+//!   in knows what it kept ([`Retained`]), and waits for somebody to acknowledge that.
 //!   A module whose computer somebody else takes away is unplugged too, until a fault unplugs it and it is plugged in again.
 //! - With a dead actuator the plant gets no torque, whatever the controller says; with a zeroed sensor the controller reads
 //!   [`Sensors::ZERO`], with a stuck one always the same sample.
@@ -23,8 +25,11 @@ use std::collections::VecDeque;
 use std::io::{self, Write};
 
 use composer_firmware::budget::step_us;
-use composer_firmware::controller::{BusKind, BusOffPolicy, Config, ConfigError, FaultSet, Micros, Stats, Timing};
+use composer_firmware::controller::{
+    Boot, BusKind, BusOffPolicy, BusStatus, Config, ConfigError, FaultSet, Micros, ResetCause, Retained, Stats, Timing,
+};
 use composer_firmware::port::{CanPort, Counts};
+use composer_firmware::safety::Safety;
 use composer_shared::observation::Sensors;
 use composer_shared::policy::{Policy, PolicyError};
 use composer_shared::robot::{AXES, MAX_MODULES};
@@ -41,6 +46,8 @@ use crate::port::Port;
 use crate::station::Station;
 
 const NEVER: u64 = u64::MAX;
+/// How long before time 0 the station arms the robot, us.
+const BEFORE_US: u64 = 1_000;
 
 /// A module's clock against true time.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -159,6 +166,9 @@ pub struct SilConfig {
     pub injected: Vec<Injected>,
     /// What controllers do after bus-off.
     pub bus_off: BusOffPolicy,
+    /// What modules keep to whatever their policy wants. By default as on a board without limits of its own, but a module whose sensors read nothing goes
+    /// on with an observation of zeros, as in the paper.
+    pub safety: Safety,
     /// Timing of the control cycle; none takes the default for policy, bus and number of modules.
     pub timing: Option<Timing>,
     /// The run ends here even if the plant is not done, ns. Default 10 minutes.
@@ -183,6 +193,7 @@ impl SilConfig {
             commands: Vec::new(),
             injected: Vec::new(),
             bus_off: BusOffPolicy::Recover,
+            safety: Safety { blind_relaxes: false, ..Safety::POLICY },
             timing: None,
             limit_ns: 600_000_000_000,
         }
@@ -339,6 +350,8 @@ struct Module<C> {
     controller: Option<C>,
     /// Somebody else took the controller away: it does not come back by itself.
     lost: bool,
+    /// What the controller that is gone kept for the next one, if only its supply broke in.
+    kept: Option<Retained>,
     clock: Clock,
     port: Port,
     next_poll_ns: u64,
@@ -554,6 +567,7 @@ impl<'c, L: Launcher> Engine<'c, L> {
             engine.modules.push(Module {
                 controller: None,
                 lost: false,
+                kept: None,
                 clock: config.clock(module),
                 port: Port::new(period),
                 next_poll_ns: 0,
@@ -580,19 +594,44 @@ impl<'c, L: Launcher> Engine<'c, L> {
         for module in 0..count {
             let started = engine.modules[module].clock.offset_us;
             engine.modules[module].clock.offset_us += wait;
-            let controller = engine.start(module, started)?;
+            let controller = engine.start(module, Boot::default(), started)?;
             engine.modules[module].controller = Some(controller);
+        }
+        if config.station {
+            engine.arm_before_the_start()?;
         }
         Ok(engine)
     }
 
-    fn start(&self, module: usize, now: Micros) -> Result<L::Computer, SilError> {
+    /// The station arms the robot a moment before time 0. That is not seen on the bus, and takes no time of the run.
+    fn arm_before_the_start(&mut self) -> Result<(), SilError> {
+        let arm = self.station.arm(false);
+        for module in 0..self.modules.len() {
+            let state = &mut self.modules[module];
+            let now = state.clock.offset_us.saturating_sub(BEFORE_US);
+            let Some(controller) = &mut state.controller else { continue };
+            let poll = Poll { now, sensors: &Sensors::ZERO, frame: Some(&arm), bus: BusStatus::ErrorActive, room: 1 };
+            let mut arm = || {
+                controller.ask_poll(&poll)?;
+                controller.answer()?;
+                // Its answer.
+                controller.next_frame(1)
+            };
+            if let Err(trouble) = arm() {
+                self.lose(module, 0, trouble)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn start(&self, module: usize, boot: Boot, now: Micros) -> Result<L::Computer, SilError> {
         let config = self.config;
         let node = config.numbers.get(module).copied().unwrap_or(module as u8);
         let mut setup = Config::new(node, self.modules.len() as u8, config.bus, &self.policy);
         setup.bus_off = config.bus_off;
+        setup.safety = config.safety;
         setup.timing = config.timing.unwrap_or(setup.timing);
-        self.launcher.start(setup, now).map_err(|trouble| match trouble {
+        self.launcher.start(setup, boot, now).map_err(|trouble| match trouble {
             Trouble::Config(error) => SilError::Config(error),
             error => SilError::Computer { module, error },
         })
@@ -671,7 +710,8 @@ impl<'c, L: Launcher> Engine<'c, L> {
         let node = self.node(module);
         let mine = |fault: &&Fault| fault.module() == Some(module);
         let has = |wanted: Fault| self.active.contains(&wanted);
-        let unplugged = has(Fault::Unplug(module));
+        let broken_in = has(Fault::BrownOut(module));
+        let unplugged = broken_in || has(Fault::Unplug(module));
         let dead = has(Fault::ActuatorDead(module));
         let zeroed = has(Fault::SensorZeroed(module));
         let stuck = has(Fault::SensorStuck(module));
@@ -699,6 +739,8 @@ impl<'c, L: Launcher> Engine<'c, L> {
         state.lost &= !unplugged;
         if unplugged && state.controller.is_some() {
             self.retire(module)?;
+            let state = &mut self.modules[module];
+            state.kept = state.controller.as_ref().filter(|_| broken_in).map(|c| c.status().retained);
             self.unplug(module, now);
         } else if !unplugged && state.controller.is_none() && !state.lost {
             self.plug(module, now)?;
@@ -751,7 +793,9 @@ impl<'c, L: Launcher> Engine<'c, L> {
 
     fn plug(&mut self, module: usize, now: u64) -> Result<(), SilError> {
         let node = self.node(module);
-        let controller = self.start(module, self.modules[module].clock.show(now))?;
+        // Their memory outlasts a supply that breaks in; that it does is what tells it from power-on.
+        let boot = self.modules[module].kept.take().map(|kept| Boot::after(kept, ResetCause::PowerOn));
+        let controller = self.start(module, boot.unwrap_or_default(), self.modules[module].clock.show(now))?;
         let state = &mut self.modules[module];
         state.controller = Some(controller);
         state.next_poll_ns = now;
@@ -787,7 +831,9 @@ impl<'c, L: Launcher> Engine<'c, L> {
             && at <= now
         {
             self.next_command += 1;
-            self.station_port.send_at(&self.station.command(command), now);
+            for frame in self.station.command(command) {
+                self.station_port.send_at(&frame, now);
+            }
         }
         let foreign = self.modules.len() + 1;
         while let Some(injected) = self.config.injected.get(self.next_injected)
@@ -902,9 +948,6 @@ impl<'c, L: Launcher> Engine<'c, L> {
     }
 
     fn tell_station<P: Plant + ?Sized>(&mut self, plant: &P, frame: &Frame, now: u64) {
-        if frame.function() != Some(Function::Sync) {
-            return;
-        }
         if let Some(frames) = self.station.receive(frame, |number| plant.point(number)) {
             // What was still to be told of the last cycle is out of date; what of it is in the port, a newer GOAL replaces.
             self.telling = frames;

@@ -12,7 +12,7 @@
 use core::hint::black_box;
 
 use composer_firmware::attitude::Attitude;
-use composer_firmware::controller::{BusKind, Config, Controller};
+use composer_firmware::controller::{Boot, BusKind, Config, Controller};
 use composer_firmware::failsafe::BusStatus;
 use composer_shared::kinematics::Chain;
 use composer_shared::nn::Dense;
@@ -183,7 +183,7 @@ fn control_steps(policy: Policy<'_>, modules: u8, random: &mut Random) {
     let node = modules - 1;
     let config = Config::new(node, modules, BusKind::Fd, &policy);
     let period = config.timing.period_us;
-    let Ok(mut controller) = Controller::new(config, policy, 0) else { return };
+    let Ok(mut controller) = Controller::new(config, policy, Boot::default(), 0) else { return };
     let empty = Message::Sync(Sync::new(0, 0, 1)).emit(0, true);
     let mut frames = [empty; FRAMES];
     let (mut sum, mut most) = (0u64, 0);

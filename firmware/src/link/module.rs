@@ -31,12 +31,12 @@ impl<'a> Module<'a> {
     /// Does what a message says and sends the answer.
     pub fn serve(&mut self, request: Result<ToModule, LinkError>, send: &mut impl FnMut(&FromModule<'_>)) {
         match request {
-            Ok(ToModule::Start { config, now }) => {
+            Ok(ToModule::Start { config, boot, now }) => {
                 // Not `*self = Module::new(..)`: that would be one more controller on the stack.
                 self.controller = None;
                 self.sensors = Sensors::ZERO;
                 self.torque = [0; AXES];
-                match Controller::new(config, self.policy, now) {
+                match Controller::new(config, self.policy, boot, now) {
                     Ok(controller) => self.controller = Some(controller),
                     Err(error) => send(&FromModule::Refused(Text::of(error).as_str())),
                 }
@@ -86,6 +86,7 @@ fn answer(
             heard: controller.heard(),
             faults: controller.faults(),
             stats: *controller.stats(),
+            retained: controller.retained(),
             attention: Weights { all: *controller.attention(), modules: controller.config().modules },
         })),
         // Served before there is a controller.

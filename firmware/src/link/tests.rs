@@ -40,7 +40,7 @@ fn every_message_fits_and_arrives() {
     let sample = Sample(Sensors { temperature: -0.0, up: [f32::MAX, f32::MIN, 1e-40], ..Sensors::ZERO });
     let frame = Carried(Frame { brs: false, ..Frame::new(0x7ff, true, &[0xff; 64]).unwrap() });
     let requests = [
-        ToModule::Start { config, now: u64::MAX },
+        ToModule::Start { config, boot: Boot::default(), now: u64::MAX },
         ToModule::Poll { now: u64::MAX, bus: BusStatus::BusOff, room: 255, sensors: Some(sample), frame: Some(frame) },
         ToModule::Frames { room: 0 },
         ToModule::Status,
@@ -62,6 +62,7 @@ fn every_message_fits_and_arrives() {
         heard: u64::MAX,
         faults: FaultSet::default(),
         stats: full,
+        retained: Retained { resets: 255, commanded: true, ..Retained::default() },
         // Weights are Q15, never more than 32767; these are the longest varints.
         attention: Weights { all: [u16::MAX; ROOM], modules: ROOM as u8 },
     };
@@ -163,7 +164,7 @@ fn a_module_says_who_it_is_and_what_it_cannot_do() {
     let refused = answers(&mut module, Err(LinkError::TooLong));
     assert!(refused[0].starts_with("Refused(\"a message on the link has more than 320"), "{refused:?}");
     let impossible = Config { node: 8, ..Config::new(0, 8, BusKind::Fd, &policy) };
-    let refused = answers(&mut module, Ok(ToModule::Start { config: impossible, now: 0 }));
+    let refused = answers(&mut module, Ok(ToModule::Start { config: impossible, boot: Boot::default(), now: 0 }));
     assert!(refused[0].contains("module 8 cannot be one of 8"), "{refused:?}");
     assert_eq!(answers(&mut module, Ok(ToModule::Status)).len(), 1);
 }
@@ -172,7 +173,8 @@ fn a_module_says_who_it_is_and_what_it_cannot_do() {
 fn a_module_that_is_started_again_is_a_new_one() {
     let image = image();
     let policy = Policy::parse(&image).unwrap();
-    let start = || Ok(ToModule::Start { config: Config::new(0, 1, BusKind::Fd, &policy), now: 0 });
+    let start =
+        || Ok(ToModule::Start { config: Config::new(0, 1, BusKind::Fd, &policy), boot: Boot::default(), now: 0 });
     let mut module = Module::new(policy);
     let poll = |now| Ok(ToModule::Poll { now, bus: BusStatus::ErrorActive, room: 16, sensors: None, frame: None });
     assert!(answers(&mut module, start()).is_empty());
@@ -208,9 +210,9 @@ proptest! {
         let image = image();
         let policy = Policy::parse(&image).unwrap();
         let config = Config::new(2, 4, BusKind::Fd, &policy);
-        let mut direct = Controller::new(config, policy, 0).unwrap();
+        let mut direct = Controller::new(config, policy, Boot::default(), 0).unwrap();
         let mut module = Module::new(policy);
-        let started = answers(&mut module, Ok(ToModule::Start { config, now: 0 }));
+        let started = answers(&mut module, Ok(ToModule::Start { config, boot: Boot::default(), now: 0 }));
         prop_assert!(started.is_empty());
         let (mut clock, mut sensors, mut torque) = (0, Sensors::ZERO, [0u32; AXES]);
         for mut request in polls {
@@ -240,7 +242,7 @@ proptest! {
         let config = Config::new(0, 8, BusKind::Fd, &policy);
         let mut module = Module::new(policy);
         let mut receiver = Receiver::default();
-        let mut bytes = bytes_of(&ToModule::Start { config, now: 0 });
+        let mut bytes = bytes_of(&ToModule::Start { config, boot: Boot::default(), now: 0 });
         let poll = ToModule::Poll { now: 5, bus: BusStatus::ErrorActive, room: 9, sensors: Some(Sample(Sensors::ZERO)), frame: None };
         let mut damaged = bytes_of(&poll);
         let at = usize::from(damage.0) % damaged.len();
@@ -255,7 +257,7 @@ proptest! {
                 prop_assert!(!answers(&mut module, request).is_empty() || silent);
             }
         }
-        for byte in bytes_of(&ToModule::Start { config, now: 0 }).into_iter().chain(bytes_of(&ToModule::Status)) {
+        for byte in bytes_of(&ToModule::Start { config, boot: Boot::default(), now: 0 }).into_iter().chain(bytes_of(&ToModule::Status)) {
             if let Some(message) = receiver.push(byte) {
                 let request = message.and_then(decode::<ToModule>);
                 prop_assert!(request.is_ok());

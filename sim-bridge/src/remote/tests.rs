@@ -57,13 +57,13 @@ struct Loopbacks<'a> {
 impl<'a> Launcher for Loopbacks<'a> {
     type Computer = Remote<Loopback<'a>>;
 
-    fn start(&self, config: Config, now: Micros) -> Result<Self::Computer, Trouble> {
+    fn start(&self, config: Config, boot: Boot, now: Micros) -> Result<Self::Computer, Trouble> {
         config.check().map_err(Trouble::Config)?;
         self.started.set(self.started.get() + 1);
         let life = self.victim.filter(|(victim, _)| *victim == config.node).map_or(usize::MAX, |(_, life)| life);
         let out = link::encode(&hello(Some(&self.policy)), &mut [0; MESSAGE_MAX]).to_vec();
         let line = Loopback { module: Module::new(self.policy), receiver: Receiver::default(), out, life };
-        Ok(Remote::new(line, config, now))
+        Ok(Remote::new(line, config, boot, now))
     }
 }
 
@@ -161,7 +161,7 @@ fn poll(messages: &[FromModule<'_>], noise: &[u8]) -> String {
     let mut bytes: Vec<u8> = Vec::new();
     messages.iter().for_each(|message| bytes.extend(link::encode(message, &mut [0; MESSAGE_MAX])));
     bytes.extend(noise);
-    let mut remote = Remote::new(Script(bytes), Config::new(0, 1, BusKind::Fd, &policy), 0);
+    let mut remote = Remote::new(Script(bytes), Config::new(0, 1, BusKind::Fd, &policy), Boot::default(), 0);
     let sensors = composer_shared::observation::Sensors::ZERO;
     let poll = Poll { now: 1, sensors: &sensors, frame: None, bus: Default::default(), room: 1 };
     let answer = remote.ask_poll(&poll).and_then(|()| remote.answer());
@@ -177,7 +177,7 @@ fn a_link_that_fails_says_how() {
     let boot = |build| {
         let hello = FromModule::Hello { protocol: PROTOCOL, firmware: 1, build, policy: Some(9) };
         let bytes = link::encode(&hello, &mut [0; MESSAGE_MAX]).to_vec();
-        Remote::new(Script(bytes), Config::new(0, 1, BusKind::Fd, &policy), 0).hello().unwrap()
+        Remote::new(Script(bytes), Config::new(0, 1, BusKind::Fd, &policy), Boot::default(), 0).hello().unwrap()
     };
     assert_eq!(boot(BUILD), Hello { firmware: 1, same_controller: true, policy: 9 });
     assert!(!boot(BUILD ^ 1).same_controller);
@@ -185,7 +185,7 @@ fn a_link_that_fails_says_how() {
     assert!(poll(&[good(), answer.clone()], &[]).contains("deadline: 7"));
     let old = FromModule::Hello { protocol: PROTOCOL + 1, firmware: 1, build: 1, policy: Some(1) };
     for (messages, noise, words) in [
-        (vec![old], &[][..], &["version 2", "version 1", "cargo qemu-image"][..]),
+        (vec![old], &[][..], &["version 3", "version 2", "cargo qemu-image"][..]),
         (
             vec![hello(None), FromModule::Refused("the policy image is damaged")],
             &[],

@@ -14,16 +14,9 @@ unsafe extern "C" {
     static __sdata: u32;
 }
 
-/// Says why the chip was reset, and lets a processor that locks up (a fault in the handler of a fault, such as a stack overflow) switch
+/// Lets a processor that locks up (a fault in the handler of a fault, such as a stack overflow) switch
 /// the PWM off by hardware.
 pub fn prepare() {
-    let reasons = pac::RCC.csr().read();
-    if reasons.iwdgrstf() {
-        defmt::error!("restarted by the watchdog");
-    } else if reasons.borrstf() {
-        defmt::info!("power is on");
-    }
-    pac::RCC.csr().modify(|w| w.set_rmvf(true));
     if &raw const _stack_start > &raw const __sdata {
         defmt::warn!("linked without flip-link: a stack that overflows would overwrite variables");
     }

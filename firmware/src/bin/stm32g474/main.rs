@@ -16,7 +16,8 @@
 //! | PA0, PA1 | ADC1 IN1, IN2 | current sense of yaw, pitch: an amplifier in the motor line (for example INA240), half the range at no current |
 //! | PA2 | ADC1 IN3 | supply voltage over 10 kohm : 1 kohm |
 //! | PC4, PC5 | ADC2 IN5, IN11 | thermistors of yaw, pitch: 10 kohm, 3435 K, below 10 kohm |
-//! | PB10 | status light | on: running; flashing once: no node page, twice: no policy, three times: no crystal |
+//! | PB10 | status light | on: running; flashing once: no node page, twice: no policy, three times: no crystal, four times: the number is taken, five times: stopped |
+//! | PB11 | stop input, with pull-up | a switch to ground that opens to stop the robot; a bridge where there is none |
 //! | PA13, PA14 | SWDIO, SWCLK | debug probe: flashing, and the log (defmt over RTT) |
 //!
 //! # Who runs when
@@ -39,12 +40,16 @@ mod can;
 mod drive;
 mod fail;
 mod flash;
+mod retained;
 mod sense;
 
 use core::cell::RefCell;
 
-use composer_firmware::controller::{BusKind, Config, ConfigError, Controller, FIRMWARE_VERSION};
+use composer_firmware::boot::Boot;
+use composer_firmware::controller::{BusKind, Config, ConfigError, Controller, FIRMWARE_VERSION, Timing};
+use composer_firmware::light;
 use composer_firmware::node_page::NodePage;
+use composer_firmware::stop_input::StopInput;
 use composer_firmware::storage::read_page;
 use composer_shared::observation::Sensors;
 use composer_shared::policy::Policy;
@@ -54,7 +59,7 @@ use defmt_rtt as _;
 use embassy_executor::Spawner;
 use embassy_stm32::adc::{Adc, AdcConfig};
 use embassy_stm32::bind_interrupts;
-use embassy_stm32::gpio::{Level, Output, Speed};
+use embassy_stm32::gpio::{Input, Level, Output, Pull, Speed};
 use embassy_stm32::peripherals::FDCAN1;
 use embassy_stm32::spi::{MODE_1, MODE_3, Spi};
 use embassy_time::{Duration, Instant, Timer, with_deadline};
@@ -85,10 +90,12 @@ fn now() -> u64 {
 #[embassy_executor::main]
 async fn main(_spawner: Spawner) -> ! {
     let Board { peripherals: p, mut watchdog, crystal } = board::start();
+    let boot = retained::boot();
+    defmt::info!("start: cause {=u8}, {=u8} unclean in a row", boot.reason(), boot.resets);
     let mut light = Output::new(p.PB10, Level::Low, Speed::Low);
     if !crystal {
         // CAN-FD needs a better clock: other modules' frames would suffer.
-        refuse(3, None, &mut light, &mut watchdog).await
+        refuse(light::NO_CRYSTAL, None, &mut light, &mut watchdog).await
     }
 
     let mut storage = Storage::new(p.FLASH);
@@ -97,7 +104,7 @@ async fn main(_spawner: Spawner) -> ! {
         Err(error) => {
             defmt::error!("{}", Display2Format(&error));
             // Without a number of its own it must not send anything.
-            refuse(1, None, &mut light, &mut watchdog).await
+            refuse(light::NO_PAGE, None, &mut light, &mut watchdog).await
         }
     };
     defmt::info!("module {=u8} of {=u8}", page.node, page.modules);
@@ -106,15 +113,15 @@ async fn main(_spawner: Spawner) -> ! {
         Ok(policy) => policy,
         Err(error) => {
             defmt::error!("{}", Display2Format(&error));
-            refuse(2, Some((&mut can, page.node)), &mut light, &mut watchdog).await
+            refuse(light::NO_POLICY, Some((&mut can, page.node)), &mut light, &mut watchdog).await
         }
     };
     defmt::info!("policy {=u32:08x} for {=str}", policy.crc(), policy.task().name());
-    let controller = match make_controller(&page, policy) {
+    let controller = match make_controller(&page, policy, boot) {
         Ok(controller) => controller,
         Err(error) => {
             defmt::error!("{}", Display2Format(error));
-            refuse(2, Some((&mut can, page.node)), &mut light, &mut watchdog).await
+            refuse(light::NO_POLICY, Some((&mut can, page.node)), &mut light, &mut watchdog).await
         }
     };
     light.set_high();
@@ -136,7 +143,8 @@ async fn main(_spawner: Spawner) -> ! {
         &page,
         policy.geometry(),
     );
-    run(controller, policy.limits().torque, &mut can, &mut sense, &mut watchdog).await
+    let stop = Input::new(p.PB11, Pull::Up);
+    run(controller, policy.limits().torque, &mut can, &mut sense, (&stop, &mut light), &mut watchdog).await
 }
 
 /// Makes the controller where it stays. Apart, and not inlined, because it is large: a copy of it in the frame of the main loop would take
@@ -145,14 +153,17 @@ async fn main(_spawner: Spawner) -> ! {
 fn make_controller(
     page: &NodePage,
     policy: Policy<'static>,
+    boot: Boot,
 ) -> Result<&'static mut Controller<'static>, &'static mut ConfigError> {
     static CONTROLLER: StaticCell<Result<Controller<'static>, ConfigError>> = StaticCell::new();
+    let timing = Timing::for_policy(&policy, BusKind::Fd, page.modules).watched_by(board::WATCHDOG_US);
     let settings = Config {
         bus_off: page.bus_off,
         safety: page.safety,
+        timing,
         ..Config::new(page.node, page.modules, BusKind::Fd, &policy)
     };
-    CONTROLLER.init_with(|| Controller::new(settings, policy, now())).as_mut()
+    CONTROLLER.init_with(|| Controller::new(settings, policy, boot, now())).as_mut()
 }
 
 /// The main loop.
@@ -161,8 +172,12 @@ async fn run(
     torque_limit: f32,
     can: &mut CanPort,
     sense: &mut Sense<'_>,
+    (stop, light): (&Input<'_>, &mut Output<'_>),
     watchdog: &mut Watchdog,
 ) -> ! {
+    let mut stop_input = StopInput::default();
+    let mut kept = controller.retained();
+    retained::keep(kept);
     let mut sensors = Sensors::ZERO;
     let mut deadline = Instant::now();
     let mut sample_at = Instant::now();
@@ -181,7 +196,15 @@ async fn run(
             log_trouble(&drive, sense);
         }
         controller.set_power(drive.power());
+        if stop_input.sample(now(), stop.is_high()) {
+            controller.emergency_stop(0);
+        }
         let outputs = controller.poll(now(), &sensors, received.as_ref(), can.status());
+        if controller.retained() != kept {
+            kept = controller.retained();
+            retained::keep(kept);
+        }
+        light.set_level(light::lit(light::flashes(controller.faults()), now()).into());
         drive::command(drive::Command {
             torque: outputs.motors_enabled.then_some(outputs.torque),
             rearm: controller.rearm(),
