@@ -1203,6 +1203,9 @@ impl<'a> Controller<'a> {
 
     /// Takes back what joints and motors do not bear any more.
     fn bear(&mut self) {
+        if self.failsafe.bears_all() {
+            return;
+        }
         let bearable = self.failsafe.bearable(self.torque);
         if bearable != self.torque {
             self.torque = bearable;

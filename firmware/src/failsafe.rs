@@ -366,17 +366,19 @@ impl Failsafe {
 
     /// Follows the joints, by the latest readings: at every poll, because within a cycle a joint gets far.
     pub fn check_joints(&mut self, sensors: &Sensors) {
-        self.joints.follow(sensors);
-        self.faults.set(Fault::JointAngle, self.joints.beyond());
-        self.faults.set(Fault::OutsideLimit, self.joints.started_beyond());
+        if self.joints.follow(sensors) {
+            self.faults.set(Fault::JointAngle, self.joints.beyond());
+            self.faults.set(Fault::OutsideLimit, self.joints.started_beyond());
+        }
     }
 
     /// Follows supply and motors.
     pub fn check_power(&mut self, now: Micros, power: &Power) {
-        self.power.follow(now, power);
-        self.faults.set(Fault::UnderVoltage, self.power.supply() == Supply::Under);
-        self.faults.set(Fault::OverVoltage, self.power.supply() == Supply::Over);
-        self.faults.set(Fault::OverCurrent, self.power.trips().any());
+        if self.power.follow(now, power) {
+            self.faults.set(Fault::UnderVoltage, self.power.supply() == Supply::Under);
+            self.faults.set(Fault::OverVoltage, self.power.supply() == Supply::Over);
+            self.faults.set(Fault::OverCurrent, self.power.trips().any());
+        }
     }
 
     /// Supply and cut-offs.
@@ -426,9 +428,18 @@ impl Failsafe {
         (torque, reason)
     }
 
+    /// Whether joints and motors bear all torques now.
+    #[inline]
+    pub fn bears_all(&self) -> bool {
+        self.joints.free() && self.power.quiet()
+    }
+
     /// What joints and motors bear of these torques now. At every poll: never more than was commanded, so the next command grows from here.
     pub fn bearable(&self, torque: [f32; AXES]) -> [f32; AXES] {
         let mut torque = self.joints.limit(torque);
+        if self.power.quiet() {
+            return torque;
+        }
         for (axis, torque) in torque.iter_mut().enumerate() {
             if self.power.trips().off(axis) {
                 *torque = 0.0;

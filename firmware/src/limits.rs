@@ -59,7 +59,8 @@ impl JointRange {
 /// The angle that reads like `reading` and is nearest to `near`, rad.
 fn unwrapped(reading: f32, near: f32) -> f32 {
     let way = reading - near;
-    near + (way - TAU * libm::roundf(way / TAU))
+    // Nearly always: rounding is dear on a processor that cannot.
+    if way.abs() <= PI { reading } else { near + (way - TAU * libm::roundf(way / TAU)) }
 }
 
 /// An end of a joint's range.
@@ -112,6 +113,11 @@ impl JointWatch {
         self.started |= true_sample;
     }
 
+    /// Whether the same reading once more would change nothing.
+    fn settled(&self) -> bool {
+        self.started && !self.lost
+    }
+
     /// Whether the joint is beyond an end.
     pub fn beyond(&self) -> bool {
         self.beyond
@@ -142,20 +148,46 @@ impl JointWatch {
 pub struct Joints {
     ranges: [JointRange; MAX_JOINTS],
     watches: [JointWatch; MAX_JOINTS],
+    /// The angles that were followed last, if there is nothing more to be learned from the same ones.
+    last: Option<[f32; MAX_JOINTS]>,
+    /// All joints bear all torques.
+    free: bool,
 }
 
 impl Joints {
     /// Joints that were not read yet. `policy` is how far from straight the policy's robot may bend a joint, rad.
     pub fn new(ranges: [JointRange; MAX_JOINTS], policy: f32) -> Self {
-        Joints { ranges: ranges.map(|range| range.within(policy)), watches: [JointWatch::default(); MAX_JOINTS] }
+        let ranges = ranges.map(|range| range.within(policy));
+        Joints { ranges, watches: [JointWatch::default(); MAX_JOINTS], last: None, free: false }
     }
 
-    /// Takes a fresh sample.
-    pub fn follow(&mut self, sensors: &Sensors) {
+    /// Takes the latest sample. Answers whether it says anything new: frames come faster than samples.
+    #[inline]
+    pub fn follow(&mut self, sensors: &Sensors) -> bool {
+        let same = |last: [f32; MAX_JOINTS]| last.iter().zip(&sensors.joint_angles).all(|(a, b)| a == b);
+        if self.last.is_some_and(same) {
+            return false;
+        }
+        self.follow_news(sensors);
+        true
+    }
+
+    fn follow_news(&mut self, sensors: &Sensors) {
         let believed = sensors.plausible();
         for ((watch, range), angle) in self.watches.iter_mut().zip(self.ranges).zip(sensors.joint_angles) {
             watch.follow(range, angle, believed);
         }
+        let settled = believed && self.watches.iter().all(JointWatch::settled);
+        self.last = settled.then_some(sensors.joint_angles);
+        let ends = [End::Min, End::Max];
+        let mut joints = self.watches.iter().zip(self.ranges);
+        self.free = joints.all(|(watch, range)| ends.iter().all(|end| watch.allows(range, *end) >= 1.0));
+    }
+
+    /// Whether all joints bear all torques.
+    #[inline]
+    pub fn free(&self) -> bool {
+        self.free
     }
 
     /// Whether a joint is beyond an end.
@@ -171,6 +203,9 @@ impl Joints {
     /// The torques (yaw, pitch) that the joints bear of those wanted. Even joints yaw, odd joints pitch; of the joints of an axis the one that bears
     /// least counts.
     pub fn limit(&self, torque: [f32; AXES]) -> [f32; AXES] {
+        if self.free {
+            return torque;
+        }
         let mut limited = torque;
         for (axis, torque) in limited.iter_mut().enumerate() {
             let outward = if *torque < 0.0 { End::Min } else { End::Max };

@@ -23,20 +23,42 @@ pub struct Power {
 pub struct PowerWatch {
     supply: SupplyWatch,
     trips: Trips,
+    /// What was said last.
+    last: Power,
+    /// All is good and has been for long: the same words once more change nothing.
+    quiet: bool,
 }
 
 impl PowerWatch {
     /// Everything good.
     pub fn new(thresholds: Thresholds) -> Self {
-        PowerWatch { supply: SupplyWatch::new(thresholds), trips: Trips::default() }
+        let (trips, last) = (Trips::default(), Power::default());
+        PowerWatch { supply: SupplyWatch::new(thresholds), trips, last, quiet: true }
     }
 
-    /// Takes what the board says.
-    pub fn follow(&mut self, now: Micros, power: &Power) {
+    /// Takes what the board says. Answers whether that may change anything: frames come faster than measurements.
+    #[inline]
+    pub fn follow(&mut self, now: Micros, power: &Power) -> bool {
+        if self.quiet && power.supply == self.last.supply && power.trips.iter().all(Option::is_none) {
+            return false;
+        }
+        self.follow_news(now, power);
+        true
+    }
+
+    fn follow_news(&mut self, now: Micros, power: &Power) {
+        self.last = *power;
         if let Some(measured) = power.supply {
             self.supply.follow(now, measured);
         }
         self.trips.follow(now, power.trips);
+        self.quiet = self.supply() == Supply::Good && self.trips.quiet();
+    }
+
+    /// Whether no motor is off and the supply is good.
+    #[inline]
+    pub fn quiet(&self) -> bool {
+        self.quiet
     }
 
     /// What is wrong with the supply.

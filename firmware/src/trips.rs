@@ -86,6 +86,11 @@ impl Trips {
         (0..AXES).any(|axis| self.off(axis))
     }
 
+    /// Whether no motor is off, and none was for so long that it is forgotten.
+    pub fn quiet(&self) -> bool {
+        self.axes.iter().all(|axis| axis.trip.is_none() && axis.count == 0)
+    }
+
     /// Whether a motor stays off until [`Trips::clear`].
     pub fn latched(&self) -> bool {
         self.axes.iter().any(Axis::latched)

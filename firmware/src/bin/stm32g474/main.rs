@@ -182,12 +182,14 @@ async fn run(
     let mut deadline = Instant::now();
     let mut sample_at = Instant::now();
     let mut sampled_at = Instant::now();
+    let mut drive = drive::Measured::NOTHING;
     let mut loops = 0;
     loop {
         let received = with_deadline(deadline.min(sample_at), can.receive()).await.ok();
         let moment = Instant::now();
-        let drive = drive::measured();
         if moment >= sample_at {
+            drive = drive::measured();
+            controller.set_power(drive.power());
             // After a long computation some samples are left out instead of made up for.
             sample_at = moment + SAMPLE;
             let seconds = (moment - sampled_at).as_micros() as f32 * 1e-6;
@@ -195,7 +197,6 @@ async fn run(
             sensors = sense.sample(seconds, drive.torque.map(|torque| torque / torque_limit));
             log_trouble(&drive, sense);
         }
-        controller.set_power(drive.power());
         if stop_input.sample(now(), stop.is_high()) {
             controller.emergency_stop(0);
         }
