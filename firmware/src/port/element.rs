@@ -1,4 +1,4 @@
-//! Frames as they lie in the message memory of Bosch's M_CAN (FDCAN of the STM32G4; RM0440, 44.3.6 and 44.3.8): two words of header and up to 16 of
+//! Frames as they lie in the message memory of Bosch's M_CAN (FDCAN of the STM32G4): two words of header and up to 16 of
 //! data, the lowest byte first.
 //!
 //! Both frame formats are understood. A node on a CAN-FD bus receives classic frames too: a person with a classic adapter can stop the robot.
@@ -44,6 +44,14 @@ pub fn decode(get: impl Fn(usize) -> u32) -> Option<Frame> {
     }
     let frame = Frame::new((identifier >> 18 & 0x7ff) as u16, fd, data.get(..len)?)?;
     Some(Frame { brs: fd && format & BRS != 0, ..frame })
+}
+
+/// A filter element: frames with a standard identifier that agrees with `id` in the bits of `mask` go into receive FIFO 0 or 1.
+pub const fn filter(id: u16, mask: u16, second: bool) -> u32 {
+    // Classic filter by mask.
+    const SFT_MASK: u32 = 0b10 << 30;
+    let fifo = if second { 2 } else { 1 };
+    SFT_MASK | fifo << 27 | ((id & 0x7ff) as u32) << 16 | (mask & 0x7ff) as u32
 }
 
 #[cfg(test)]
@@ -105,6 +113,12 @@ mod tests {
         assert_eq!(frame.payload(), [1, 2, 3, 4, 5, 6, 7, 8]);
         assert!(!frame.brs);
         assert_eq!(read(&[0x180 << 18, 15 << 16 | BRS, 0, 0]).map(|frame| frame.brs), Some(false));
+    }
+
+    #[test]
+    fn a_filter_is_where_the_reference_manual_has_it() {
+        assert_eq!(filter(0x180, 0x780, false), 0x8980_0780);
+        assert_eq!(filter(0x080, 0x780, true), 0x9080_0780);
     }
 
     #[test]

@@ -1,158 +1,301 @@
-//! The CAN port: FDCAN1, 1 Mbit/s and 5 Mbit/s, behind queues.
+//! The CAN port: FDCAN1 at 1 Mbit/s and 5 Mbit/s, by its registers.
+//!
+//! The driver of embassy-stm32 fills the chip's slots in order of arrival, so that frames which lose every arbitration keep the others from taking
+//! part, and it knows no way to take one back. Here [`Sender`] decides what lies in the three transmit buffers, the same code that the simulator
+//! runs; this file loads them, aborts them, and looks what became of them.
+//!
+//! - Line 0 of the interrupts empties both receive FIFOs, of three frames each, into one queue.
+//! - Line 1 comes when a frame got through, came back, or the bus-off state changed. It puts the next frame into its slot at once, even while the
+//!   main loop computes.
 
-use core::num::{NonZeroU8, NonZeroU16};
+use core::cell::UnsafeCell;
+use core::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
-use composer_firmware::controller::BusStatus;
+use composer_firmware::controller::{BusStatus, Micros};
 use composer_firmware::failsafe::BusOffPolicy;
+use composer_firmware::port::{CanPort, Counts, Outcome, PortStatus, RECEIVED, Sender, Slots, element};
 use composer_shared::wire::{Frame, Function};
-use embassy_stm32::Peri;
-use embassy_stm32::can::config::{
-    DataBitTiming, FdCanConfig, FrameTransmissionConfig, GlobalFilter, NominalBitTiming, TxBufferMode,
-};
-use embassy_stm32::can::enums::BusErrorMode;
-use embassy_stm32::can::filter::{Action, Filter, FilterType, StandardFilter};
-use embassy_stm32::can::frame::{FdFrame, Header};
-use embassy_stm32::can::{BufferedCanFd, BufferedFdCanSender, CanConfigurator, OperatingMode, RxFdBuf, TxFdBuf};
-use embassy_stm32::pac;
+use embassy_stm32::gpio::{AfType, Flex, OutputType, Pull, Speed};
+use embassy_stm32::interrupt::InterruptExt;
+use embassy_stm32::pac::can::vals::{Anfe, Anfs, Tfqm};
 use embassy_stm32::peripherals::{FDCAN1, PA11, PA12};
-use embedded_can::{Id, StandardId};
+use embassy_stm32::{Peri, interrupt, pac, rcc};
+use embassy_sync::blocking_mutex::raw::CriticalSectionRawMutex;
+use embassy_sync::channel::Channel;
+use embassy_time::Instant;
 
-use static_cell::ConstStaticCell;
+const CAN: pac::can::Fdcan = pac::FDCAN1;
+const RAM: pac::fdcanram::Fdcanram = pac::FDCANRAM1;
 
-use crate::Irqs;
-
-/// Frames that may wait while the controller computes: at 5 Mbit/s one of 64 bytes takes at least 0.14 ms.
-const RECEIVED: usize = 16;
-/// Frames that may wait for the bus, besides three in the chip. What the controller has beyond that it keeps, and replaces when it gets old.
-const SENT: usize = 2;
-
-static RX: ConstStaticCell<RxFdBuf<RECEIVED>> = ConstStaticCell::new(RxFdBuf::new());
-static TX: ConstStaticCell<TxFdBuf<SENT>> = ConstStaticCell::new(TxFdBuf::new());
+/// Control period until the policy is known, us.
+const PERIOD: Micros = 50_000;
+/// Alternate function of both pins.
+const AF: u8 = 9;
 
 // 170 MHz without prescaler for both phases: 170 and 34 quanta a bit, sampled at 80 and 79.4 %.
-const SEG1: u8 = 26;
-const SEG2: u8 = 7;
+const NOMINAL: (u8, u8) = (135, 34);
+const DATA: (u8, u8) = (26, 7);
 
 /// The bits of an identifier that say the function; the others say the module.
 const FUNCTION: u16 = 0x780;
 
+static SENDER: Shared = Shared(UnsafeCell::new(Sender::new(PERIOD)));
+static QUEUE: Channel<CriticalSectionRawMutex, Frame, RECEIVED> = Channel::new();
+static OVERFLOWED: AtomicU32 = AtomicU32::new(0);
+/// Whether to come back after bus-off.
+static RECOVER: AtomicBool = AtomicBool::new(true);
+
 /// The CAN port.
-pub struct CanPort {
-    bus: BufferedCanFd<'static, SENT, RECEIVED>,
-    sender: BufferedFdCanSender,
-    /// A frame that found the queue full.
-    waiting: Option<FdFrame>,
+pub struct Fdcan {
+    /// They belong to FDCAN1 as long as this lives.
+    _pins: [Flex<'static>; 2],
 }
 
-fn count(n: u8) -> NonZeroU8 {
-    NonZeroU8::new(n).unwrap_or(NonZeroU8::MIN)
+/// The transmit buffers.
+struct Buffers;
+
+impl Slots for Buffers {
+    fn load(&mut self, slot: usize, frame: &Frame) {
+        element::encode(frame, |number, word| RAM.txbuf(element::WORDS * slot + number).write_value(word));
+        CAN.txbar().write(|w| w.set_ar(slot, true));
+    }
+
+    fn abort(&mut self, slot: usize) {
+        CAN.txbcr().write(|w| w.set_cr(slot, true));
+    }
+
+    fn outcome(&mut self, slot: usize) -> Outcome {
+        // A request stays pending until the frame got through or, asked back, is off the wire.
+        if CAN.txbrp().read().trp(slot) {
+            Outcome::Pending
+        } else if CAN.txbto().read().to(slot) {
+            Outcome::Sent
+        } else {
+            Outcome::Returned
+        }
+    }
 }
 
-fn config(bus_off: BusOffPolicy) -> FdCanConfig {
-    FdCanConfig::default()
-        .set_nominal_bit_timing(NominalBitTiming {
-            prescaler: NonZeroU16::MIN,
-            seg1: count(135),
-            seg2: count(34),
-            sync_jump_width: count(34),
-        })
-        .set_data_bit_timing(DataBitTiming {
-            // embassy-stm32 0.6 ignores this, see `compensate_delay`.
-            transceiver_delay_compensation: true,
-            prescaler: NonZeroU16::MIN,
-            seg1: count(SEG1),
-            seg2: count(SEG2),
-            sync_jump_width: count(SEG2),
-        })
-        .set_frame_transmit(FrameTransmissionConfig::AllowFdCanAndBRS)
-        .set_tx_buffer_mode(TxBufferMode::Priority)
-        // What no filter knows is not for us.
-        .set_global_filter(GlobalFilter::reject_all())
-        .set_automatic_bus_off_recovery(bus_off == BusOffPolicy::Recover)
+/// The sender belongs to the interrupt of line 1. The main loop works on it with that line masked, and that line alone: the current loops do not
+/// wait for it.
+struct Shared(UnsafeCell<Sender>);
+
+// SAFETY: only `with_sender`, in the main loop, and the handler of line 1 touch it, and the first masks the second.
+unsafe impl Sync for Shared {}
+
+/// Works on the sender, from the main loop.
+fn with_sender<T>(work: impl FnOnce(&mut Sender) -> T) -> T {
+    interrupt::FDCAN1_IT1.disable();
+    // What was on its way to the processor is through.
+    cortex_m::asm::dsb();
+    cortex_m::asm::isb();
+    // SAFETY: the handler does not run, and `work` has no way to come here again.
+    let result = work(unsafe { &mut *SENDER.0.get() });
+    // SAFETY: nothing refers to the sender any more.
+    unsafe { interrupt::FDCAN1_IT1.enable() };
+    result
 }
 
-/// One filter for every function that this bus has, so that noise does not even cost an interrupt. By mask: the range filters of embassy-stm32 0.6
-/// are broken. The bursts of all modules go into one of the chip's queues, what must not get lost among them into the other.
-fn filters() -> impl Iterator<Item = StandardFilter> {
-    let functions = Function::ALL.into_iter().filter(|function| *function != Function::LatentFragment);
-    functions.map(|function| Filter {
-        filter: FilterType::BitMask { filter: function.id(0), mask: FUNCTION },
-        action: match function {
-            Function::State | Function::Latent => Action::StoreInFifo0,
-            _ => Action::StoreInFifo1,
-        },
-    })
+/// Now, us.
+fn now() -> Micros {
+    Instant::now().as_micros()
 }
 
-/// Transmitter delay compensation: at 5 Mbit/s a bit comes back through the transceiver when the next one is already being sent, so a sender
-/// has to look later than at its own sample point, by the delay it measures. embassy-stm32 0.6 does not set it.
-fn compensate_delay() {
-    let regs = pac::FDCAN1;
-    regs.cccr().modify(|w| w.set_init(true));
-    while !regs.cccr().read().init() {}
-    regs.cccr().modify(|w| w.set_cce(true));
-    // As far behind the measured delay as the sample point lies behind the start of the bit.
-    regs.tdcr().write(|w| w.set_tdco(1 + SEG1));
-    regs.dbtp().modify(|w| w.set_tdc(true));
-    regs.cccr().modify(|w| w.set_cce(false));
-    regs.cccr().modify(|w| w.set_init(false));
-    while regs.cccr().read().init() {}
-}
-
-impl CanPort {
+impl Fdcan {
     /// Goes onto the bus. Only once.
     pub fn new(
-        fdcan: Peri<'static, FDCAN1>,
+        _fdcan: Peri<'static, FDCAN1>,
         rx: Peri<'static, PA11>,
         tx: Peri<'static, PA12>,
         bus_off: BusOffPolicy,
     ) -> Self {
-        let mut configurator = CanConfigurator::new(fdcan, rx, tx, Irqs);
-        configurator.set_config(config(bus_off));
-        let mut slots = [StandardFilter::disable(); 28];
-        slots.iter_mut().zip(filters()).for_each(|(slot, filter)| *slot = filter);
-        configurator.properties().set_standard_filters(&slots);
-        let can = configurator.start(OperatingMode::NormalOperationMode);
-        compensate_delay();
-        let bus = can.buffered_fd(TX.take(), RX.take());
-        CanPort { sender: bus.writer(), bus, waiting: None }
-    }
-
-    /// The next frame of this protocol. Cancelling it loses nothing.
-    pub async fn receive(&mut self) -> Frame {
-        loop {
-            // An error here is the chip's note about the last bit that went wrong; it counts those itself, see `status`.
-            let Ok(envelope) = self.bus.read().await else { continue };
-            let header = envelope.frame.header();
-            let (Id::Standard(id), true) = (header.id(), header.fdcan()) else { continue };
-            if let Some(mut frame) = Frame::new(id.as_raw(), true, envelope.frame.data()) {
-                frame.brs = header.bit_rate_switching();
-                return frame;
-            }
+        let (mut rx, mut tx) = (Flex::new(rx), Flex::new(tx));
+        rx.set_as_af_unchecked(AF, AfType::input(Pull::None));
+        tx.set_as_af_unchecked(AF, AfType::output(OutputType::PushPull, Speed::VeryHigh));
+        RECOVER.store(bus_off == BusOffPolicy::Recover, Ordering::Relaxed);
+        rcc::enable_and_reset::<FDCAN1>();
+        configure();
+        // SAFETY: the handlers only touch registers of FDCAN1, a queue behind a lock, and the sender, see `with_sender`.
+        unsafe {
+            interrupt::FDCAN1_IT0.enable();
+            interrupt::FDCAN1_IT1.enable();
         }
+        Fdcan { _pins: [rx, tx] }
     }
 
-    /// Sends what `next` offers as long as there is room.
-    pub fn send(&mut self, mut next: impl FnMut() -> Option<Frame>) {
-        while let Some(frame) = self.waiting.take().or_else(|| next().as_ref().and_then(encode)) {
-            if let Err(embassy_sync::channel::TrySendError::Full(frame)) = self.sender.try_write(frame) {
-                self.waiting = Some(frame);
-                break;
-            }
+    /// Sets the control period of the robot, us: how long frames are worth sending.
+    pub fn set_period(&mut self, period: Micros) {
+        with_sender(|sender| sender.set_period(period));
+    }
+
+    /// Waits for the next received frame. Cancelling it loses nothing.
+    pub async fn received(&mut self) -> Frame {
+        QUEUE.receive().await
+    }
+}
+
+impl CanPort for Fdcan {
+    fn send(&mut self, frame: &Frame) {
+        with_sender(|sender| sender.push(now(), frame));
+    }
+
+    fn room(&self) -> usize {
+        with_sender(|sender| sender.room())
+    }
+
+    fn receive(&mut self) -> Option<Frame> {
+        QUEUE.try_receive().ok()
+    }
+
+    fn poll(&mut self) {
+        with_sender(|sender| sender.poll(now(), &mut Buffers));
+    }
+
+    fn status(&self) -> PortStatus {
+        let (state, errors) = (CAN.psr().read(), CAN.ecr().read());
+        let (bus, transmit_errors) = match (state.bo(), state.ep()) {
+            (true, _) => (BusStatus::BusOff, 256),
+            (_, true) => (BusStatus::ErrorPassive, errors.tec().into()),
+            _ => (BusStatus::ErrorActive, errors.tec().into()),
+        };
+        // The counter itself ends at 127.
+        let receive_errors = if errors.rp() { 128 } else { errors.rec().into() };
+        let counts = with_sender(|sender| sender.counts());
+        let overflowed = OVERFLOWED.load(Ordering::Relaxed);
+        PortStatus { bus, transmit_errors, receive_errors, counts: Counts { overflowed, ..counts } }
+    }
+}
+
+/// Sets the peripheral up and lets it go onto the bus.
+fn configure() {
+    CAN.cccr().modify(|w| w.set_init(true));
+    while !CAN.cccr().read().init() {}
+    CAN.cccr().modify(|w| w.set_cce(true));
+    CAN.cccr().modify(|w| {
+        w.set_fdoe(true);
+        w.set_brse(true);
+    });
+    CAN.nbtp().write(|w| {
+        w.set_nbrp(0);
+        w.set_ntseg1(NOMINAL.0 - 1);
+        w.set_ntseg2(NOMINAL.1 - 1);
+        w.set_nsjw(NOMINAL.1 - 1);
+    });
+    CAN.dbtp().write(|w| {
+        w.set_dbrp(0);
+        w.set_dtseg1(DATA.0 - 1);
+        w.set_dtseg2(DATA.1 - 1);
+        w.set_dsjw(DATA.1 - 1);
+        w.set_tdc(true);
+    });
+    // Transmitter delay compensation: at 5 Mbit/s a bit comes back through the transceiver when the next one is already being sent, so a
+    // sender has to look later than at its own sample point: as far behind the delay it measures as that lies behind the start of the bit.
+    CAN.tdcr().write(|w| w.set_tdco(1 + DATA.0));
+    CAN.txbc().write(|w| w.set_tfqm(Tfqm::QUEUE));
+
+    // One filter for every function that this bus has, so that noise does not even cost an interrupt. The bursts of all modules go into one
+    // of the receive FIFOs, what must not get lost among them into the other.
+    let functions = Function::ALL.into_iter().filter(|function| *function != Function::LatentFragment);
+    let mut filters = 0;
+    for (slot, function) in functions.enumerate() {
+        let second = !matches!(function, Function::State | Function::Latent);
+        RAM.flssa(slot).write_value(element::filter(function.id(0), FUNCTION, second));
+        filters += 1;
+    }
+    CAN.rxgfc().write(|w| {
+        w.set_lss(filters);
+        w.set_lse(0);
+        // What no filter knows is not for us, nor are remote frames.
+        w.set_anfs(Anfs::REJECT);
+        w.set_anfe(Anfe::REJECT);
+        w.set_rrfs(true);
+        w.set_rrfe(true);
+    });
+
+    // Every transmit buffer reports that its frame got through, and that it came back.
+    CAN.txbtie().write(|w| (0..3).for_each(|slot| w.set_tie(slot, true)));
+    CAN.txbcie().write(|w| (0..3).for_each(|slot| w.set_cfie(slot, true)));
+    CAN.ie().write(|w| {
+        for fifo in 0..2 {
+            w.set_rfne(fifo, true);
+            w.set_rfle(fifo, true);
         }
-    }
+        w.set_tce(true);
+        w.set_tcfe(true);
+        w.set_boe(true);
+    });
+    CAN.ils().write(|w| {
+        w.set_smsg(true);
+        w.set_perr(true);
+    });
+    CAN.ile().write(|w| {
+        w.set_eint0(true);
+        w.set_eint1(true);
+    });
+    go_online();
+}
 
-    /// How the chip is (ISO 11898-1 fault confinement).
-    pub fn status(&self) -> BusStatus {
-        match self.bus.properties().bus_error_mode() {
-            BusErrorMode::ErrorActive => BusStatus::ErrorActive,
-            BusErrorMode::ErrorPassive => BusStatus::ErrorPassive,
-            BusErrorMode::BusOff => BusStatus::BusOff,
+/// Takes part in the bus; after bus-off that takes 128 times 11 recessive bits.
+fn go_online() {
+    CAN.cccr().modify(|w| w.set_cce(false));
+    CAN.cccr().modify(|w| w.set_init(false));
+}
+
+/// Takes what a receive FIFO has.
+fn empty(fifo: usize) {
+    loop {
+        let state = CAN.rxfs(fifo).read();
+        if state.ffl() == 0 {
+            return;
+        }
+        let first = element::WORDS * usize::from(state.fgi());
+        let frame = element::decode(|number| {
+            if fifo == 0 { RAM.rxfifo0(first + number).read() } else { RAM.rxfifo1(first + number).read() }
+        });
+        CAN.rxfa(fifo).write(|w| w.set_fai(state.fgi()));
+        if let Some(frame) = frame
+            && QUEUE.try_send(frame).is_err()
+        {
+            OVERFLOWED.fetch_add(1, Ordering::Relaxed);
         }
     }
 }
 
-fn encode(frame: &Frame) -> Option<FdFrame> {
-    let header = Header::new_fd(StandardId::new(frame.id)?.into(), frame.len, false, frame.brs);
-    FdFrame::new(header, frame.payload()).ok()
+#[embassy_stm32::interrupt]
+fn FDCAN1_IT0() {
+    let flags = CAN.ir().read();
+    for fifo in 0..2 {
+        CAN.ir().write(|w| {
+            w.set_rfn(fifo, true);
+            w.set_rfl(fifo, true);
+        });
+        if flags.rfl(fifo) {
+            OVERFLOWED.fetch_add(1, Ordering::Relaxed);
+        }
+        empty(fifo);
+    }
+}
+
+#[embassy_stm32::interrupt]
+fn FDCAN1_IT1() {
+    let flags = CAN.ir().read();
+    CAN.ir().write(|w| {
+        w.set_tc(true);
+        w.set_tcf(true);
+        w.set_bo(flags.bo());
+    });
+    // SAFETY: the main loop is not at it, or this line would be masked; and the handler does not interrupt itself.
+    let sender = unsafe { &mut *SENDER.0.get() };
+    if flags.bo() {
+        let off = CAN.psr().read().bo();
+        sender.set_bus_off(off);
+        if off {
+            // Forgets all requests. The chip is in initialisation now, and stays there until it is told to come back.
+            CAN.cccr().modify(|w| w.set_cce(true));
+            if RECOVER.load(Ordering::Relaxed) {
+                go_online();
+            }
+        }
+    }
+    sender.poll(now(), &mut Buffers);
 }

@@ -23,7 +23,7 @@
 //! # Who runs when
 //!
 //! - The interrupt of the ADC, 10,000 times a second: the current loops ([`drive`]). Nothing interrupts it ([`board`]).
-//! - The interrupts of FDCAN: received frames into a queue, because the chip's own holds only three ([`can`]).
+//! - The interrupts of FDCAN: received frames into a queue, because the chip's own holds only three, and the next frame into a transmit buffer ([`can`]).
 //! - The main loop: waits for a frame, the controller's deadline, or the next sample of the sensors a millisecond later; polls the
 //!   controller, sets the motors, sends what it offers.
 //!
@@ -49,6 +49,7 @@ use composer_firmware::boot::Boot;
 use composer_firmware::controller::{BusKind, Config, ConfigError, Controller, FIRMWARE_VERSION, Timing};
 use composer_firmware::light;
 use composer_firmware::node_page::NodePage;
+use composer_firmware::port::CanPort;
 use composer_firmware::stop_input::StopInput;
 use composer_firmware::storage::read_page;
 use composer_shared::observation::Sensors;
@@ -58,22 +59,15 @@ use defmt::Display2Format;
 use defmt_rtt as _;
 use embassy_executor::Spawner;
 use embassy_stm32::adc::{Adc, AdcConfig};
-use embassy_stm32::bind_interrupts;
 use embassy_stm32::gpio::{Input, Level, Output, Pull, Speed};
-use embassy_stm32::peripherals::FDCAN1;
 use embassy_stm32::spi::{MODE_1, MODE_3, Spi};
 use embassy_time::{Duration, Instant, Timer, with_deadline};
 use static_cell::StaticCell;
 
 use board::{Board, Watchdog};
-use can::CanPort;
+use can::Fdcan;
 use flash::Storage;
 use sense::Sense;
-
-bind_interrupts!(struct Irqs {
-    FDCAN1_IT0 => embassy_stm32::can::IT0InterruptHandler<FDCAN1>;
-    FDCAN1_IT1 => embassy_stm32::can::IT1InterruptHandler<FDCAN1>;
-});
 
 defmt::timestamp!("{=u64:us}", now());
 
@@ -108,7 +102,7 @@ async fn main(_spawner: Spawner) -> ! {
         }
     };
     defmt::info!("module {=u8} of {=u8}", page.node, page.modules);
-    let mut can = CanPort::new(p.FDCAN1, p.PA11, p.PA12, page.bus_off);
+    let mut can = Fdcan::new(p.FDCAN1, p.PA11, p.PA12, page.bus_off);
     let policy = match flash::policy() {
         Ok(policy) => policy,
         Err(error) => {
@@ -116,6 +110,7 @@ async fn main(_spawner: Spawner) -> ! {
             refuse(light::NO_POLICY, Some((&mut can, page.node)), &mut light, &mut watchdog).await
         }
     };
+    can.set_period(policy.control_period_us().into());
     defmt::info!("policy {=u32:08x} for {=str}", policy.crc(), policy.task().name());
     let controller = match make_controller(&page, policy, boot) {
         Ok(controller) => controller,
@@ -170,7 +165,7 @@ fn make_controller(
 async fn run(
     controller: &mut Controller<'static>,
     torque_limit: f32,
-    can: &mut CanPort,
+    can: &mut Fdcan,
     sense: &mut Sense<'_>,
     (stop, light): (&Input<'_>, &mut Output<'_>),
     watchdog: &mut Watchdog,
@@ -185,7 +180,7 @@ async fn run(
     let mut drive = drive::Measured::NOTHING;
     let mut loops = 0;
     loop {
-        let received = with_deadline(deadline.min(sample_at), can.receive()).await.ok();
+        let received = with_deadline(deadline.min(sample_at), can.received()).await.ok();
         let moment = Instant::now();
         if moment >= sample_at {
             drive = drive::measured();
@@ -200,7 +195,7 @@ async fn run(
         if stop_input.sample(now(), stop.is_high()) {
             controller.emergency_stop(0);
         }
-        let outputs = controller.poll(now(), &sensors, received.as_ref(), can.status());
+        let outputs = controller.poll(now(), &sensors, received.as_ref(), can.status().bus);
         if controller.retained() != kept {
             kept = controller.retained();
             retained::keep(kept);
@@ -211,7 +206,7 @@ async fn run(
             rearm: controller.rearm(),
         });
         deadline = Instant::from_micros(outputs.deadline);
-        can.send(|| controller.next_frame());
+        can.send_all(|| controller.next_frame());
         if drive.loops != loops {
             loops = drive.loops;
             watchdog.pet();
@@ -242,7 +237,7 @@ fn log_trouble(drive: &drive::Measured, sense: &mut Sense<'_>) {
 
 /// A module that cannot run: the motors are off, the light says why (`flashes` in a row), and with a number it sends HEARTBEAT now and then, so
 /// that the station sees it. Ends with a restart only.
-async fn refuse(flashes: u8, can: Option<(&mut CanPort, u8)>, light: &mut Output<'_>, watchdog: &mut Watchdog) -> ! {
+async fn refuse(flashes: u8, can: Option<(&mut Fdcan, u8)>, light: &mut Output<'_>, watchdog: &mut Watchdog) -> ! {
     let heartbeat = can.map(|(can, node)| {
         let heartbeat = Heartbeat {
             mode: Mode::Boot as u8,
@@ -263,8 +258,8 @@ async fn refuse(flashes: u8, can: Option<(&mut CanPort, u8)>, light: &mut Output
             && Instant::now() >= heartbeat_at
         {
             heartbeat_at += REFUSED_HEARTBEAT;
-            let mut frame = Some(*frame);
-            can.send(|| frame.take());
+            can.send(frame);
+            can.poll();
         }
         // On and off for every flash, then a pause as long as six.
         blink = (blink + 1) % (2 * (flashes + 3));

@@ -7,6 +7,7 @@
 #[allow(dead_code)] // Each image uses its part.
 mod board;
 #[path = "../stm32g474/can.rs"]
+#[allow(dead_code)]
 mod can;
 #[path = "../stm32g474/fail.rs"]
 mod fail;
@@ -16,22 +17,16 @@ mod flash;
 
 use composer_firmware::controller::FIRMWARE_VERSION;
 use composer_firmware::failsafe::{BusOffPolicy, BusStatus};
+use composer_firmware::port::CanPort;
 use composer_firmware::storage::read_page;
 use composer_shared::wire::{Health, Heartbeat, Message, Mode, NOBODY, PROTOCOL_VERSION};
 use defmt_rtt as _;
 use embassy_executor::Spawner;
-use embassy_stm32::bind_interrupts;
-use embassy_stm32::peripherals::FDCAN1;
 use embassy_time::{Duration, Instant, Timer, with_timeout};
 
 use board::Board;
-use can::CanPort;
+use can::Fdcan;
 use flash::Storage;
-
-bind_interrupts!(struct Irqs {
-    FDCAN1_IT0 => embassy_stm32::can::IT0InterruptHandler<FDCAN1>;
-    FDCAN1_IT1 => embassy_stm32::can::IT1InterruptHandler<FDCAN1>;
-});
 
 defmt::timestamp!("{=u64:us}", Instant::now().as_micros());
 
@@ -52,7 +47,7 @@ async fn main(_spawner: Spawner) -> ! {
         Some(node) => defmt::info!("module {=u8}", node),
         None => defmt::warn!("no node page: listening only"),
     }
-    let mut can = CanPort::new(p.FDCAN1, p.PA11, p.PA12, BusOffPolicy::Recover);
+    let mut can = Fdcan::new(p.FDCAN1, p.PA11, p.PA12, BusOffPolicy::Recover);
     let heartbeat = Heartbeat {
         mode: Mode::Service as u8,
         fault: 0,
@@ -66,22 +61,26 @@ async fn main(_spawner: Spawner) -> ! {
     let mut last = BusStatus::ErrorActive;
     loop {
         watchdog.pet();
-        if let Ok(frame) = with_timeout(PATIENCE, can.receive()).await {
+        if let Ok(frame) = with_timeout(PATIENCE, can.received()).await {
             defmt::info!("{=u16:03x} {=[u8]:02x}", frame.id, frame.payload());
         }
         let status = can.status();
-        if status != last {
-            match status {
+        if status.bus != last {
+            let (sent, received) = (status.transmit_errors, status.receive_errors);
+            defmt::info!("transmit errors {=u16}, receive errors {=u16}", sent, received);
+            match status.bus {
                 BusStatus::ErrorActive => defmt::info!("error active: few errors"),
                 BusStatus::ErrorPassive => defmt::warn!("error passive: many errors; is anybody else on the bus?"),
                 BusStatus::BusOff => defmt::error!("bus-off"),
             }
-            last = status;
+            last = status.bus;
         }
         if Instant::now() >= send_at {
             send_at = Instant::now() + SEND_EVERY;
-            let mut frame = node.map(|node| Message::Heartbeat(heartbeat).emit(node, true));
-            can.send(|| frame.take());
+            if let Some(node) = node {
+                can.send(&Message::Heartbeat(heartbeat).emit(node, true));
+            }
         }
+        can.poll();
     }
 }
