@@ -2,6 +2,7 @@
 
 pub mod bus;
 pub mod bus_trial;
+pub mod campaign;
 pub mod cli;
 pub mod env;
 pub mod environment;

@@ -64,3 +64,30 @@ fn files_that_are_no_scenarios_are_refused_before_anything_runs() {
     .unwrap();
     refuse(folder.path(), &["test", "a.toml"], &["a.toml cannot be", "unknown field `colour`"]);
 }
+
+#[test]
+fn a_campaign_goes_on_where_it_was_and_shards_make_the_same_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let campaign =
+        |more: &[&str]| succeed(folder.path(), &[&["campaign", "--schedules", "24", "--seed", "3"], more].concat());
+    assert!(campaign(&["--out", "whole.jsonl"]).contains("24 schedules, 0 break a rule"));
+    let whole = std::fs::read_to_string(path("whole.jsonl")).unwrap();
+    // Cut off in the middle of a line, as by a full disk.
+    std::fs::write(path("cut.jsonl"), &whole[..whole.len() - 9]).unwrap();
+    campaign(&["--out", "cut.jsonl"]);
+    assert_eq!(std::fs::read_to_string(path("cut.jsonl")).unwrap(), whole);
+    for part in ["0/3", "1/3", "2/3"] {
+        campaign(&["--shard", part]);
+    }
+    let parts = ["runs/campaign-0-of-3.jsonl", "runs/campaign-1-of-3.jsonl", "runs/campaign-2-of-3.jsonl"];
+    campaign(&[&["--out", "merged.jsonl", "--merge"], &parts[..]].concat());
+    assert_eq!(std::fs::read_to_string(path("merged.jsonl")).unwrap(), whole);
+    refuse(folder.path(), &["campaign", "--shard", "3/3"], &["3/3", "I/N"]);
+    refuse(
+        folder.path(),
+        &["campaign", "--schedules", "24", "--seed", "4", "--out", "whole.jsonl"],
+        &["another campaign"],
+    );
+    refuse(folder.path(), &["campaign", "--number", "1", "--schedule", "explode:1"], &["unknown fault `explode`"]);
+}

@@ -2,6 +2,7 @@
 
 mod bench;
 mod bus;
+mod campaign;
 mod common;
 mod dbc;
 mod demo;
@@ -46,6 +47,8 @@ enum Verb {
     Sil(sil::Arguments),
     /// Run scenarios on the simulated bus: faults, and what is expected of the robot, as data.
     Test(test::Arguments),
+    /// Search for a schedule of faults that breaks a rule, and shrink it.
+    Campaign(campaign::Arguments),
     /// Make a published comparison from nothing: figure, table, data.
     Report(report::Arguments),
     /// Measure the speed of physics, training and bus on this machine.
@@ -87,6 +90,7 @@ pub fn main() -> ExitCode {
         Some(Verb::Export(arguments)) => export::run(&arguments),
         Some(Verb::Sil(arguments)) => sil::run(&arguments),
         Some(Verb::Test(arguments)) => test::run(&arguments),
+        Some(Verb::Campaign(arguments)) => campaign::run(&arguments),
         Some(Verb::Report(arguments)) => report::run(&arguments),
         Some(Verb::Bench(arguments)) => bench::run(&arguments),
         Some(Verb::Flash(arguments)) => flash::run(&arguments),
