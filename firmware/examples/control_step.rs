@@ -7,7 +7,7 @@
 //!
 //! It includes everything: frames parsed, kinematics, observation, encoder, attention, actor, frames built.
 
-use composer_firmware::controller::{BusKind, Config, Controller};
+use composer_firmware::controller::{Boot, BusKind, Config, Controller};
 use composer_firmware::failsafe::BusStatus;
 use composer_shared::observation::Sensors;
 use composer_shared::policy::{IMAGE_SIZE, Policy, random_image};
@@ -23,7 +23,7 @@ fn main() {
     let mut robot: Vec<Controller> = (0..modules)
         .map(|node| {
             let config = Config::new(node, modules, BusKind::Fd, &policy);
-            Controller::new(config, policy, 0).expect("a valid configuration")
+            Controller::new(config, policy, Boot::default(), 0).expect("a valid configuration")
         })
         .collect();
     let mut sensors = Sensors { up: [0.0, 0.1, 0.99], temperature: 25.0, ..Sensors::ZERO };

@@ -713,6 +713,21 @@ impl<'a> Controller<'a> {
         self.serves = false;
     }
 
+    /// The policy.
+    pub fn policy(&self) -> &Policy<'a> {
+        &self.policy
+    }
+
+    /// The torque that the motors are told to give, yaw and pitch, in the robot's torque unit; zero if relaxed.
+    pub fn torque(&self) -> [f32; AXES] {
+        self.torque
+    }
+
+    /// Whether the module must not answer: its number is another's, too, or it is off the bus.
+    pub fn silenced(&self) -> bool {
+        self.failsafe.silenced()
+    }
+
     /// The active faults.
     pub fn faults(&self) -> FaultSet {
         self.failsafe.faults()
@@ -1189,10 +1204,13 @@ impl<'a> Controller<'a> {
         // As fast as the time since the last action allows; a period at most, which is what the policy was trained with.
         let period = self.period();
         let seconds = self.last_act.map_or(period, |last| self.now.saturating_sub(last).min(period)) as f32 / 1e6;
-        let (torque, limited_by) = self.failsafe.command(self.torque, action, seconds);
-        self.torque = torque;
-        self.limited_by = limited_by;
-        self.enabled = !self.failsafe.relaxed();
+        // In a jog the station drives.
+        if self.jog.is_none() {
+            let (torque, limited_by) = self.failsafe.command(self.torque, action, seconds);
+            self.torque = torque;
+            self.limited_by = limited_by;
+            self.enabled = !self.failsafe.relaxed();
+        }
         self.last_act = Some(self.now);
         up(&mut self.stats.acted);
         if self.used != 0 {

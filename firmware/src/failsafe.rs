@@ -128,6 +128,11 @@ impl FaultSet {
         FaultSet(self.0 & !bit(fault))
     }
 
+    /// As a mask: bit n says fault 32 + n.
+    pub const fn bits(self) -> u32 {
+        self.0
+    }
+
     fn set(&mut self, fault: Fault, active: bool) {
         if active {
             self.0 |= bit(fault);

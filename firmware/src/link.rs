@@ -150,6 +150,21 @@ pub struct Status {
 }
 
 impl Status {
+    /// Of a module that is off.
+    pub fn off() -> Self {
+        Status {
+            mode: Mode::Boot as u8,
+            cycle: 0,
+            time_keeper: None,
+            alive: 0,
+            heard: 0,
+            faults: FaultSet::EMPTY,
+            stats: Stats::default(),
+            retained: Retained::default(),
+            attention: Weights { all: [0; ROOM], modules: 0 },
+        }
+    }
+
     /// What the module is at; `None` if no mode has this number.
     pub fn mode(&self) -> Option<Mode> {
         Mode::from_number(self.mode)

@@ -198,7 +198,7 @@ registers! {
     21 Alive[2] "alive" U32 ReadOnly 0 .. MOST, 1, "";
     /// Modules attended over in the last action, in the same way.
     23 Heard[2] "heard" U32 ReadOnly 0 .. MOST, 1, "";
-    /// Why the module started last: 0 power-on, others by the board's documentation.
+    /// Why the module started last: 1 power-on, 2 RESTART, 3 reset pin, 4 watchdog, 5 brown-out, 6 software, 7 anything else.
     25 ResetReason "reset_reason" U32 ReadOnly 0 .. 255, 1, "";
     /// Starts in a row that nobody asked for.
     26 Resets "resets" U32 ReadOnly 0 .. MOST, 1, "";
@@ -229,7 +229,7 @@ registers! {
     41 WithoutSync "without_sync" U32 ReadOnly 0 .. MOST, 1, "";
     /// Frames lost because the receive queue was full.
     42 RxOverflow "rx_overflow" U32 ReadOnly 0 .. MOST, 1, "";
-    /// Frames taken back from the CAN port before they were sent, for more urgent or newer ones.
+    /// Frames taken back from the CAN port before they were sent: more urgent or newer ones came, or they were too old.
     43 Aborted "aborted" U32 ReadOnly 0 .. MOST, 1, "";
     /// Transmit error counter of the CAN controller.
     44 Tec "tec" U32 ReadOnly 0 .. 256, 1, "";
@@ -249,6 +249,10 @@ registers! {
     56 LogNewest "log_newest" U32 ReadOnly 0 .. MOST, 1, "";
     /// Entries that the fault log lost because its memory was full while the module was armed.
     57 LogLost "log_lost" U32 ReadOnly 0 .. MOST, 1, "";
+    /// Times the CAN controller went bus-off.
+    58 BusOffs "bus_offs" U32 ReadOnly 0 .. MOST, 1, "";
+    /// Frames that found no room in the CAN port.
+    59 TxLost "tx_lost" U32 ReadOnly 0 .. MOST, 1, "";
 
     /// Encoder as it reads, without zero and direction; 4294967295: no reading.
     64 EncoderRaw[4] "encoder_raw" U32 ReadOnly 0 .. MOST, core::f64::consts::TAU / 16384.0, "rad";

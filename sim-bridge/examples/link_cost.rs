@@ -6,7 +6,7 @@
 use std::path::Path;
 use std::time::Instant;
 
-use composer_firmware::controller::{BusKind, Config};
+use composer_firmware::controller::{Boot, BusKind, Config};
 use composer_shared::observation::Sensors;
 use composer_shared::policy::{IMAGE_SIZE, Policy, random_image};
 use composer_shared::wire::{Frame, Function};
@@ -29,7 +29,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         for (what, frame) in [("time alone", None), ("a latent", latent)] {
             let mut micros = Vec::new();
             for modules in [1, 8] {
-                let start = |_| qemu.start(Config::new(1, 8, BusKind::Fd, &policy), 0);
+                let start = |_| qemu.start(Config::new(1, 8, BusKind::Fd, &policy), Boot::default(), 0);
                 let mut computers: Vec<_> = (0..modules).map(start).collect::<Result<_, _>>()?;
                 let mut begin = Instant::now();
                 for round in 0..501 {

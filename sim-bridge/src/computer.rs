@@ -1,8 +1,8 @@
 //! What runs the controller of one module: the simulation's own process, or something at the end of a wire.
 
-use composer_firmware::controller::{
-    Boot, BusStatus, Config, ConfigError, Controller, FaultSet, Micros, Outputs, Retained, Stats,
-};
+use composer_firmware::controller::{Boot, BusStatus, Config, ConfigError, FaultSet, Micros, Outputs, Retained, Stats};
+use composer_firmware::emulated::Emulated;
+use composer_firmware::node_page::Calibration;
 use composer_shared::observation::Sensors;
 use composer_shared::policy::Policy;
 use composer_shared::robot::MAX_MODULES;
@@ -100,16 +100,22 @@ pub trait Launcher {
     fn start(&self, config: Config, boot: Boot, now: Micros) -> Result<Self::Computer, Trouble>;
 }
 
-/// Controllers in this process.
-#[derive(Clone, Copy, Debug)]
+/// Modules in this process.
+#[derive(Clone, Debug)]
 pub struct InProcess<'a> {
     policy: Policy<'a>,
+    mounted: Vec<Calibration>,
 }
 
 impl<'a> InProcess<'a> {
-    /// Controllers with this policy.
+    /// Modules with this policy.
     pub fn new(policy: Policy<'a>) -> Self {
-        InProcess { policy }
+        InProcess { policy, mounted: Vec::new() }
+    }
+
+    /// The same with hardware that is mounted like this, by number; modules beyond the list have the nominal one. Their first node pages say so.
+    pub fn mounted(self, mounted: Vec<Calibration>) -> Self {
+        InProcess { mounted, ..self }
     }
 }
 
@@ -117,31 +123,41 @@ impl<'a> Launcher for InProcess<'a> {
     type Computer = Local<'a>;
 
     fn start(&self, config: Config, boot: Boot, now: Micros) -> Result<Local<'a>, Trouble> {
-        let controller = Controller::new(config, self.policy, boot, now).map_err(Trouble::Config)?;
+        let mut module = Emulated::new(self.policy);
+        let mounted = self.mounted.get(usize::from(config.node)).copied().unwrap_or(Calibration::NOMINAL);
+        module.start(config, boot, now, mounted).map_err(Trouble::Config)?;
         let outputs = Outputs { torque: Default::default(), motors_enabled: false, deadline: now };
-        Ok(Local { controller, outputs })
+        Ok(Local { module, outputs })
     }
 }
 
-/// A controller in this process.
+/// A module in this process.
 #[derive(Debug)]
 pub struct Local<'a> {
-    controller: Controller<'a>,
+    module: Emulated<'a>,
     outputs: Outputs,
+}
+
+impl<'a> Local<'a> {
+    /// The module.
+    pub fn module(&mut self) -> &mut Emulated<'a> {
+        &mut self.module
+    }
 }
 
 impl Computer for Local<'_> {
     fn ask_poll(&mut self, poll: &Poll<'_>) -> Result<(), Trouble> {
-        self.outputs = self.controller.poll(poll.now, poll.sensors, poll.frame, poll.bus);
+        self.outputs = self.module.poll(poll.now, poll.sensors, poll.frame, poll.bus);
         Ok(())
     }
 
     fn answer(&mut self) -> Result<Answer, Trouble> {
-        Ok(Answer { outputs: self.outputs, acted: self.controller.stats().acted })
+        let acted = self.module.controller().map_or(0, |controller| controller.stats().acted);
+        Ok(Answer { outputs: self.outputs, acted })
     }
 
     fn next_frame(&mut self, _room: usize) -> Result<Option<Frame>, Trouble> {
-        Ok(self.controller.next_frame())
+        Ok(self.module.next_frame())
     }
 
     fn ask_status(&mut self) -> Result<(), Trouble> {
@@ -153,7 +169,20 @@ impl Computer for Local<'_> {
     }
 
     fn status(&self) -> Status<'_> {
-        let controller = &self.controller;
+        const NOTHING: &[u16; MAX_MODULES] = &[0; MAX_MODULES];
+        let Some(controller) = self.module.controller() else {
+            return Status {
+                mode: Mode::Boot,
+                cycle: 0,
+                time_keeper: None,
+                alive: 0,
+                heard: 0,
+                attention: NOTHING,
+                faults: FaultSet::EMPTY,
+                stats: Stats::default(),
+                retained: Retained::default(),
+            };
+        };
         Status {
             mode: controller.mode(),
             cycle: controller.cycle(),

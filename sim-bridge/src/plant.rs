@@ -23,3 +23,40 @@ pub trait Plant {
     /// Whether the episode is over (success, or its time is up).
     fn done(&self) -> bool;
 }
+
+/// A robot on the bench: straight, level, at room temperature, and nothing moves it.
+#[derive(Clone, Copy, Debug)]
+pub struct Bench {
+    /// How many modules it has.
+    pub modules: usize,
+    /// Steps of 5 ms that are left.
+    pub steps: u32,
+}
+
+impl Plant for Bench {
+    fn modules(&self) -> usize {
+        self.modules
+    }
+
+    fn step_ns(&self) -> u64 {
+        5_000_000
+    }
+
+    fn sensors(&self, _module: usize) -> Sensors {
+        Sensors { up: [0.0, 0.0, 1.0], temperature: 25.0, ..Sensors::ZERO }
+    }
+
+    fn point(&self, _number: u8) -> Option<[f32; 3]> {
+        None
+    }
+
+    fn set_torque(&mut self, _module: usize, _torque: [f32; AXES]) {}
+
+    fn step(&mut self) {
+        self.steps = self.steps.saturating_sub(1);
+    }
+
+    fn done(&self) -> bool {
+        self.steps == 0
+    }
+}

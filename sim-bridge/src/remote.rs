@@ -5,9 +5,9 @@ use std::time::Duration;
 
 use composer_firmware::controller::{Boot, Config, Micros, Outputs};
 use composer_firmware::link::{
-    self, BUILD, Carried, FromModule, LinkError, MESSAGE_MAX, PROTOCOL, Receiver, Sample, ToModule, Weights,
+    self, BUILD, Carried, FromModule, LinkError, MESSAGE_MAX, PROTOCOL, Receiver, Sample, ToModule,
 };
-use composer_shared::robot::{AXES, MAX_MODULES};
+use composer_shared::robot::AXES;
 use composer_shared::wire::{Frame, Mode};
 
 use crate::computer::{Answer, Computer, Poll, Status, Trouble};
@@ -112,17 +112,7 @@ impl<L: Line> Remote<L> {
             frames: VecDeque::new(),
             asked: 0,
             drained: true,
-            status: link::Status {
-                mode: Mode::Boot as u8,
-                cycle: 0,
-                time_keeper: None,
-                alive: 0,
-                heard: 0,
-                faults: Default::default(),
-                stats: Default::default(),
-                retained: Default::default(),
-                attention: Weights { all: [0; MAX_MODULES], modules: 0 },
-            },
+            status: link::Status::off(),
         }
     }
 

@@ -21,6 +21,9 @@ use serde::Deserialize;
 /// What runs in the control step.
 const CONTROL_STEP: [&str; 2] =
     ["composer_firmware::controller::Controller::poll", "composer_firmware::controller::Controller::next_frame"];
+/// What runs after it, in images that have a service.
+const SERVICE: [&str; 2] =
+    ["composer_firmware::service::Service::poll", "composer_firmware::service::Service::next_frame"];
 /// Where every panic ends.
 const PANIC: &str = "__rustc::rust_begin_unwind";
 /// What an exception pushes, with the registers of the floating-point unit (ARMv7-M ARM, B1.5.7), aligned to 8 bytes.
@@ -47,6 +50,8 @@ struct Budget {
     policy: Place,
     flash: u64,
     step_stack: u32,
+    /// None: the image has no service.
+    service_stack: Option<u32>,
     ram: Option<u64>,
     #[serde(default)]
     interrupts: Vec<String>,
@@ -104,6 +109,10 @@ fn images_stay_within_their_budgets() {
             budget.step_stack.into(),
             &chain,
         ));
+        if let Some(limit) = budget.service_stack {
+            let (service, chain) = budget.deepest(&image, &SERVICE);
+            complaints.extend(check(program, "the stack of the service", service.into(), limit.into(), &chain));
+        }
         if let Some(limit) = budget.ram {
             let (stack, chain) = budget.deepest(&image, &["Reset"]);
             let interrupts: Vec<&str> = budget.interrupts.iter().map(String::as_str).collect();
@@ -118,15 +127,16 @@ fn images_stay_within_their_budgets() {
 }
 
 #[test]
-fn no_panic_can_be_reached_from_the_control_step() {
+fn no_panic_can_be_reached_from_the_control_step_and_the_service() {
     for budget in budgets() {
         let image = budget.image();
         // The way there must be known at all: the image itself does panic, in the end.
         assert!(!image.named(PANIC).is_empty(), "{} has no panic handler of that name", budget.program);
-        let entries = CONTROL_STEP.iter().flat_map(|name| image.entry(name));
+        let service = SERVICE.iter().filter(|_| budget.service_stack.is_some());
+        let entries = CONTROL_STEP.iter().chain(service).flat_map(|name| image.entry(name));
         let complaints: Vec<String> =
             entries.flat_map(|entry| image.complaints(entry, &|name| name == PANIC)).collect();
-        assert!(complaints.is_empty(), "the control step of {} can panic:\n{}", budget.program, complaints.join("\n"));
+        assert!(complaints.is_empty(), "{} can panic:\n{}", budget.program, complaints.join("\n"));
     }
 }
 

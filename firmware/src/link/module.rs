@@ -6,6 +6,8 @@ use composer_shared::robot::AXES;
 
 use super::{BUILD, Carried, FromModule, LinkError, PROTOCOL, Sample, Status, Text, ToModule, Weights};
 use crate::controller::{Controller, FIRMWARE_VERSION};
+use crate::emulated::Emulated;
+use crate::node_page::Calibration;
 
 /// What a module says when it has booted.
 pub fn hello(policy: Option<&Policy<'_>>) -> FromModule<'static> {
@@ -15,8 +17,7 @@ pub fn hello(policy: Option<&Policy<'_>>) -> FromModule<'static> {
 /// A module at the end of a link.
 #[derive(Clone, Debug)]
 pub struct Module<'a> {
-    policy: Policy<'a>,
-    controller: Option<Controller<'a>>,
+    module: Emulated<'a>,
     sensors: Sensors,
     /// The torque that the simulator knows, by its bits.
     torque: [u32; AXES],
@@ -25,33 +26,30 @@ pub struct Module<'a> {
 impl<'a> Module<'a> {
     /// A module with this policy in its flash that has not been started.
     pub fn new(policy: Policy<'a>) -> Self {
-        Module { policy, controller: None, sensors: Sensors::ZERO, torque: [0; AXES] }
+        Module { module: Emulated::new(policy), sensors: Sensors::ZERO, torque: [0; AXES] }
     }
 
     /// Does what a message says and sends the answer.
     pub fn serve(&mut self, request: Result<ToModule, LinkError>, send: &mut impl FnMut(&FromModule<'_>)) {
         match request {
             Ok(ToModule::Start { config, boot, now }) => {
-                // Not `*self = Module::new(..)`: that would be one more controller on the stack.
-                self.controller = None;
                 self.sensors = Sensors::ZERO;
                 self.torque = [0; AXES];
-                match Controller::new(config, self.policy, boot, now) {
-                    Ok(controller) => self.controller = Some(controller),
-                    Err(error) => send(&FromModule::Refused(Text::of(error).as_str())),
+                if let Err(error) = self.module.start(config, boot, now, Calibration::NOMINAL) {
+                    send(&FromModule::Refused(Text::of(error).as_str()));
                 }
             }
-            Ok(request) => match &mut self.controller {
-                Some(controller) => answer(controller, &mut self.sensors, &mut self.torque, &request, send),
-                None => send(&FromModule::Refused("the module has not been started")),
-            },
+            Ok(request) if self.module.is_started() => {
+                answer(&mut self.module, &mut self.sensors, &mut self.torque, &request, send);
+            }
+            Ok(_) => send(&FromModule::Refused("the module has not been started")),
             Err(error) => send(&FromModule::Refused(Text::of(error).as_str())),
         }
     }
 }
 
 fn answer(
-    controller: &mut Controller<'_>,
+    module: &mut Emulated<'_>,
     sensors: &mut Sensors,
     torque: &mut [u32; AXES],
     request: &ToModule,
@@ -62,41 +60,47 @@ fn answer(
             if let Some(Sample(sample)) = sample {
                 *sensors = *sample;
             }
-            let outputs = controller.poll(*now, sensors, frame.as_ref().map(|frame| &frame.0), *bus);
+            let outputs = module.poll(*now, sensors, frame.as_ref().map(|frame| &frame.0), *bus);
             let bits = outputs.torque.map(f32::to_bits);
             let changed = bits != *torque;
             *torque = bits;
-            send_frames(controller, *room, send);
+            send_frames(module, *room, send);
             send(&FromModule::Answer {
                 torque: changed.then_some(outputs.torque),
                 motors_enabled: outputs.motors_enabled,
                 deadline: outputs.deadline,
-                acted: controller.stats().acted,
+                acted: module.controller().map_or(0, |controller| controller.stats().acted),
             });
         }
         ToModule::Frames { room } => {
-            send_frames(controller, *room, send);
+            send_frames(module, *room, send);
             send(&FromModule::Sent);
         }
-        ToModule::Status => send(&FromModule::Status(Status {
-            mode: controller.mode() as u8,
-            cycle: controller.cycle(),
-            time_keeper: controller.time_keeper(),
-            alive: controller.alive(),
-            heard: controller.heard(),
-            faults: controller.faults(),
-            stats: *controller.stats(),
-            retained: controller.retained(),
-            attention: Weights { all: *controller.attention(), modules: controller.config().modules },
-        })),
+        ToModule::Status => send(&FromModule::Status(status(module.controller()))),
         // Served before there is a controller.
         ToModule::Start { .. } => {}
     }
 }
 
-fn send_frames(controller: &mut Controller<'_>, room: u8, send: &mut impl FnMut(&FromModule<'_>)) {
+/// What the controller is at. A module that could not start again says that it is off.
+fn status(controller: Option<&Controller<'_>>) -> Status {
+    let Some(controller) = controller else { return Status::off() };
+    Status {
+        mode: controller.mode() as u8,
+        cycle: controller.cycle(),
+        time_keeper: controller.time_keeper(),
+        alive: controller.alive(),
+        heard: controller.heard(),
+        faults: controller.faults(),
+        stats: *controller.stats(),
+        retained: controller.retained(),
+        attention: Weights { all: *controller.attention(), modules: controller.config().modules },
+    }
+}
+
+fn send_frames(module: &mut Emulated<'_>, room: u8, send: &mut impl FnMut(&FromModule<'_>)) {
     for _ in 0..room {
-        let Some(frame) = controller.next_frame() else { break };
+        let Some(frame) = module.next_frame() else { break };
         send(&FromModule::Frame(Carried(frame)));
     }
 }
