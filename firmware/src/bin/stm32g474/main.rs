@@ -25,7 +25,7 @@
 //! - The interrupt of the ADC, 10,000 times a second: the current loops ([`drive`]). Nothing interrupts it ([`board`]).
 //! - The interrupts of FDCAN: received frames into a queue, because the chip's own holds only three, and the next frame into a transmit buffer ([`can`]).
 //! - The main loop: waits for a frame, the controller's deadline, or the next sample of the sensors a millisecond later; polls the
-//!   controller, sets the motors, sends what it offers.
+//!   controller and the service, sets the motors, sends what they offer.
 //!
 //! The independent watchdog is fed by the main loop and only if the current loops ran since the last time. Anything that stops either
 //! resets the chip within [`board::WATCHDOG_US`]; then all pins float and the motors coast. It runs before anything is waited for. If the crystal does not
@@ -40,6 +40,7 @@ mod can;
 mod drive;
 mod fail;
 mod flash;
+mod hardware;
 mod retained;
 mod sense;
 
@@ -50,6 +51,7 @@ use composer_firmware::controller::{BusKind, Config, ConfigError, Controller, FI
 use composer_firmware::light;
 use composer_firmware::node_page::NodePage;
 use composer_firmware::port::CanPort;
+use composer_firmware::service::Service;
 use composer_firmware::stop_input::StopInput;
 use composer_firmware::storage::read_page;
 use composer_shared::observation::Sensors;
@@ -67,6 +69,7 @@ use static_cell::StaticCell;
 use board::{Board, Watchdog};
 use can::Fdcan;
 use flash::Storage;
+use hardware::Hardware;
 use sense::Sense;
 
 defmt::timestamp!("{=u64:us}", now());
@@ -138,8 +141,11 @@ async fn main(_spawner: Spawner) -> ! {
         &page,
         policy.geometry(),
     );
+    let mut hardware = Hardware::new(storage);
+    let service = make_service(page, controller, &mut hardware);
     let stop = Input::new(p.PB11, Pull::Up);
-    run(controller, policy.limits().torque, &mut can, &mut sense, (&stop, &mut light), &mut watchdog).await
+    let mut parts = Parts { can: &mut can, sense: &mut sense, hardware: &mut hardware, stop: &stop, light: &mut light };
+    run(controller, service, policy.limits().torque, &mut parts, &mut watchdog).await
 }
 
 /// Makes the controller where it stays. Apart, and not inlined, because it is large: a copy of it in the frame of the main loop would take
@@ -161,15 +167,31 @@ fn make_controller(
     CONTROLLER.init_with(|| Controller::new(settings, policy, boot, now())).as_mut()
 }
 
+/// Makes the service where it stays, for the same reason.
+#[inline(never)]
+fn make_service(page: NodePage, controller: &mut Controller<'static>, hardware: &mut Hardware) -> &'static mut Service {
+    static SERVICE: StaticCell<Service> = StaticCell::new();
+    SERVICE.init_with(|| Service::new(page, controller, now(), hardware))
+}
+
+/// What the main loop deals with.
+struct Parts<'a, 'b> {
+    can: &'a mut Fdcan,
+    sense: &'a mut Sense<'b>,
+    hardware: &'a mut Hardware,
+    stop: &'a Input<'static>,
+    light: &'a mut Output<'static>,
+}
+
 /// The main loop.
 async fn run(
     controller: &mut Controller<'static>,
+    service: &mut Service,
     torque_limit: f32,
-    can: &mut Fdcan,
-    sense: &mut Sense<'_>,
-    (stop, light): (&Input<'_>, &mut Output<'_>),
+    parts: &mut Parts<'_, '_>,
     watchdog: &mut Watchdog,
 ) -> ! {
+    let Parts { can, sense, hardware, stop, light } = parts;
     let mut stop_input = StopInput::default();
     let mut kept = controller.retained();
     retained::keep(kept);
@@ -190,23 +212,33 @@ async fn run(
             let seconds = (moment - sampled_at).as_micros() as f32 * 1e-6;
             sampled_at = moment;
             sensors = sense.sample(seconds, drive.torque.map(|torque| torque / torque_limit));
+            hardware.note(sense, &drive, can.status());
             log_trouble(&drive, sense);
         }
         if stop_input.sample(now(), stop.is_high()) {
             controller.emergency_stop(0);
         }
         let outputs = controller.poll(now(), &sensors, received.as_ref(), can.status().bus);
+        service.poll(now(), controller, &sensors, received.as_ref(), *hardware);
+        let restart = service.restart_due(now());
+        if restart {
+            controller.expect_restart();
+        }
         if controller.retained() != kept {
             kept = controller.retained();
             retained::keep(kept);
         }
-        light.set_level(light::lit(light::flashes(controller.faults()), now()).into());
+        if restart {
+            cortex_m::peripheral::SCB::sys_reset();
+        }
+        let lit = light::lit(light::flashes(controller.faults()), now());
+        light.set_level(service.light(now()).unwrap_or(lit).into());
         drive::command(drive::Command {
             torque: outputs.motors_enabled.then_some(outputs.torque),
             rearm: controller.rearm(),
         });
-        deadline = Instant::from_micros(outputs.deadline);
-        can.send_all(|| controller.next_frame());
+        deadline = Instant::from_micros(outputs.deadline.min(service.deadline()));
+        can.send_all(|| controller.next_frame().or_else(|| service.next_frame(controller)));
         if drive.loops != loops {
             loops = drive.loops;
             watchdog.pet();

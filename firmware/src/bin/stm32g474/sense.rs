@@ -4,7 +4,7 @@ use core::cell::RefCell;
 
 use composer_firmware::drivers::encoder::{As5047p, EncoderError};
 use composer_firmware::drivers::imu::{ImuError, Lsm6dso};
-use composer_firmware::drivers::sensors::{Joint, ModuleSensors};
+use composer_firmware::drivers::sensors::{Joint, ModuleSensors, RawReadings};
 use composer_firmware::drivers::thermistor::Thermistor;
 use composer_firmware::node_page::NodePage;
 use composer_shared::observation::Sensors;
@@ -46,6 +46,7 @@ pub struct Sense<'a> {
     sensors: ModuleSensors<Shared<'a>, Alone, Delay>,
     adc: Adc<'static, ADC2>,
     thermistors: (Peri<'static, PC4>, Peri<'static, PC5>),
+    temperatures: [f32; AXES],
     log_at: Instant,
 }
 
@@ -74,7 +75,7 @@ impl<'a> Sense<'a> {
         let mut sensors = ModuleSensors::new(joints, joint_count, imu);
         // If it fails, the samples fail; it is tried again when they have failed for a while.
         let _ = sensors.init(&mut Delay);
-        Sense { sensors, adc, thermistors: (yaw, pitch), log_at: Instant::now() }
+        Sense { sensors, adc, thermistors: (yaw, pitch), temperatures: [f32::NAN; AXES], log_at: Instant::now() }
     }
 
     /// Reads everything, `seconds` after the last time; the motors say their `torque`.
@@ -92,6 +93,7 @@ impl<'a> Sense<'a> {
         let yaw = self.adc.blocking_read(&mut self.thermistors.0, time);
         let pitch = self.adc.blocking_read(&mut self.thermistors.1, time);
         let [yaw, pitch] = [yaw, pitch].map(|raw| THERMISTOR.celsius(f32::from(raw) / ADC_RANGE));
+        self.temperatures = [yaw, pitch];
         // `f32::max` would hide the one that is torn off.
         if yaw.is_nan() || yaw > pitch { yaw } else { pitch }
     }
@@ -99,6 +101,16 @@ impl<'a> Sense<'a> {
     /// What failed in the last sample: joint by joint, and the inertial sensor.
     pub fn errors(&self) -> ([Option<EncoderError>; MAX_JOINTS], Option<ImuError>) {
         self.sensors.errors()
+    }
+
+    /// What the chips read last.
+    pub fn raw(&self) -> RawReadings {
+        self.sensors.raw()
+    }
+
+    /// The motors' temperatures in the last sample, degrees Celsius.
+    pub fn temperatures(&self) -> [f32; AXES] {
+        self.temperatures
     }
 
     /// Whether it is time for a look at them.
