@@ -26,8 +26,8 @@ pub const SLOTS: usize = 3;
 /// Frames that wait for a slot: a latent in eight pieces and one frame of each other function, with room to spare.
 pub const WAITING: usize = 16;
 
-/// Received frames that wait while the controller computes. A control step of 64 modules takes 2.4 ms
-/// ([`crate::budget::step_us`]), in which at most 43 frames of the shortest kind go over a bus at 1 and 5 Mbit/s.
+/// Received frames that wait while the controller computes. A control step of 64 modules takes 2.8 ms
+/// ([`crate::budget::step_us`]), in which at most 50 frames of the shortest kind go over a bus at 1 and 5 Mbit/s.
 pub const RECEIVED: usize = 64;
 
 /// A CAN port as the main loop of a module sees it. It knows what time it is.

@@ -148,7 +148,7 @@ pub struct SilConfig {
     /// a Cortex-M4 at 170 MHz needs for the observation and the encoder.
     pub encode_latency_us: u32,
     /// From the last LATENT needed (or the collection deadline) until the torque is at the motor, us. None, the default, takes what a whole control
-    /// step of that many modules may take on the Cortex-M4F ([`composer_firmware::budget::step_us`]): 662 for 8 modules, 2441 for 64.
+    /// step of that many modules may take on the Cortex-M4F ([`composer_firmware::budget::step_us`]): 662 for 8 modules, 2787 for 64.
     pub act_latency_us: Option<u32>,
     /// From hearing SYNC until GOAL is ready to be sent, us. Default 50.
     pub station_latency_us: u32,

@@ -7,6 +7,7 @@ use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
+use composer_firmware::budget::{CLOCK_HZ, CYCLES_PER_100_INSTRUCTIONS, step_instructions};
 use composer_sim_bridge::qemu::{PROGRAM, QemuError};
 
 /// What it emulates, and how it counts.
@@ -25,8 +26,6 @@ const CONDITIONS: [&str; 11] = [
 ];
 /// Longest that it may take.
 const PATIENCE: Duration = Duration::from_secs(120);
-/// Clock of the microcontroller that the image is flashed on, MHz.
-const CLOCK: f64 = 170.0;
 
 /// Arguments of `bench firmware`.
 #[derive(clap::Args, Clone, Debug)]
@@ -124,14 +123,18 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     println!("{:<44} {:>8.2}", "ratio", portable as f64 / dsp as f64);
 
     println!(
-        "\none whole control step of the last module on the bus, CAN-FD, all frames parsed; ms of the longest at {CLOCK} MHz"
+        "\none whole control step of the last module on the bus, CAN-FD, all frames parsed; ms of the longest at {} MHz",
+        CLOCK_HZ / 1_000_000
     );
-    println!("{:>8} {:>10} {:>10} {:>14} {:>16}", "modules", "mean", "longest", "1 cycle/insn", "1.5 cycles/insn");
+    let cycles = f64::from(CYCLES_PER_100_INSTRUCTIONS) / 100.0;
+    let most = format!("{cycles} cycles/insn");
+    println!("{:>8} {:>10} {:>10} {:>14} {most:>16} {:>12}", "modules", "mean", "longest", "1 cycle/insn", "may take");
     for modules in [8, 16, 32, 64] {
         let mean = count(&format!("control_step/{modules}/mean"))?;
         let longest = count(&format!("control_step/{modules}/max"))?;
-        let ms = longest as f64 / (CLOCK * 1e3);
-        println!("{modules:>8} {mean:>10} {longest:>10} {ms:>14.2} {:>16.2}", 1.5 * ms);
+        let ms = longest as f64 * 1e3 / f64::from(CLOCK_HZ);
+        let budget = step_instructions(modules);
+        println!("{modules:>8} {mean:>10} {longest:>10} {ms:>14.2} {:>16.2} {budget:>12}", cycles * ms);
     }
     println!("\na controller is {} bytes, whatever the number of modules", count("controller_bytes")?);
     Ok(())
