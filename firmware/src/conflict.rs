@@ -2,7 +2,7 @@
 //! a gateway that echoes.
 //!
 //! A twin that takes part sends STATE or SYNC of the present cycle, again and again; a recording is of another cycle. Both count, the fresh ones
-//! [`FRESH`] times as much, but only once a period, and periods without any count against it. At [`CERTAIN`] it is a twin.
+//! `FRESH` times as much, but only once a period, and periods without any count against it. At `CERTAIN` it is a twin.
 
 use crate::controller::Micros;
 

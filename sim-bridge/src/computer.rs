@@ -22,7 +22,7 @@ pub enum Trouble {
     Failed(Box<dyn std::error::Error + Send + Sync>),
 }
 
-/// The inputs of [`Controller::poll`].
+/// The inputs of [`Emulated::poll`].
 #[derive(Clone, Copy, Debug)]
 pub struct Poll<'a> {
     /// The module's clock, us.

@@ -86,7 +86,8 @@ impl<'a> Module<'a> {
         let mut board = Bench { storage: Dying { flash, left: usize::MAX, noise: 1 }, raw: raw() };
         let page = read_page(board.storage()).unwrap_or(page());
         let policy = Policy::parse(image).unwrap();
-        let config = Config::new(page.node, page.modules, BusKind::Fd, &policy);
+        let settings = Config::new(page.node, page.modules, BusKind::Fd, &policy);
+        let config = Config { safety: page.safety, bus_off: page.bus_off, ..settings };
         let mut controller = Controller::new(config, policy, Boot::default(), 0).unwrap();
         let service = Service::new(page, &mut controller, 0, &mut board);
         let sensors = Sensors { up: [0.0, 0.0, 1.0], temperature: 25.0, ..Sensors::ZERO };
@@ -671,6 +672,29 @@ fn one_axis_is_jogged_within_its_limits_and_for_a_limited_time() {
         assert_eq!(module.ask(Operation::Jog, axis, value), Err(code), "{axis} {value:#x}");
         assert_ne!(module.controller.mode(), Mode::Service);
     }
+}
+
+#[test]
+fn a_jog_does_not_push_a_joint_beyond_its_end() {
+    let image = image();
+    let mut module = Module::new(&image);
+    module.run(500 * MS);
+    let outwards = |module: &mut Module<'_>, angle| {
+        module.sensors.joint_angles[2] = angle;
+        module.ask(Operation::Jog, 0, jog(300, 300)).unwrap();
+        module.run(200 * MS);
+        module.controller.torque()[0]
+    };
+    // The end of joint 2 is at 1.5 rad, and outward torque falls over the last tenth.
+    assert_eq!(outwards(&mut module, 1.3), 24.0);
+    let near = outwards(&mut module, 1.45);
+    assert!(near > 0.0 && near < 13.0, "{near}");
+    assert_eq!(outwards(&mut module, 1.51), 0.0);
+    assert_eq!(module.controller.mode(), Mode::Service);
+    // Inwards it may be driven back.
+    module.ask(Operation::Jog, 0, jog(-300, 300)).unwrap();
+    module.run(200 * MS);
+    assert_eq!(module.controller.torque()[0], -24.0);
 }
 
 #[test]
