@@ -23,7 +23,9 @@ fn main() {
     let mut robot: Vec<Controller> = (0..modules)
         .map(|node| {
             let config = Config::new(node, modules, BusKind::Fd, &policy);
-            Controller::new(config, policy, Boot::default(), 0).expect("a valid configuration")
+            let mut module = Controller::new(config, policy, Boot::default(), 0).expect("a valid configuration");
+            module.arm(false).expect("nothing forbids it");
+            module
         })
         .collect();
     let mut sensors = Sensors { up: [0.0, 0.1, 0.99], temperature: 25.0, ..Sensors::ZERO };

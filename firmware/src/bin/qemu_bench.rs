@@ -14,6 +14,8 @@ use core::hint::black_box;
 use composer_firmware::attitude::Attitude;
 use composer_firmware::controller::{Boot, BusKind, Config, Controller};
 use composer_firmware::failsafe::BusStatus;
+use composer_firmware::power::Power;
+use composer_firmware::supply::Extremes;
 use composer_shared::kinematics::Chain;
 use composer_shared::nn::Dense;
 use composer_shared::observation::{Seeker, Sensors, Told, observe};
@@ -184,6 +186,8 @@ fn control_steps(policy: Policy<'_>, modules: u8, random: &mut Random) {
     let config = Config::new(node, modules, BusKind::Fd, &policy);
     let period = config.timing.period_us;
     let Ok(mut controller) = Controller::new(config, policy, Boot::default(), 0) else { return };
+    controller.set_power(Power { supply: Some(Extremes::steady(12.0)), ..Power::default() });
+    let armed = controller.arm(false).is_ok();
     let empty = Message::Sync(Sync::new(0, 0, 1)).emit(0, true);
     let mut frames = [empty; FRAMES];
     let (mut sum, mut most) = (0u64, 0);
@@ -217,7 +221,8 @@ fn control_steps(policy: Policy<'_>, modules: u8, random: &mut Random) {
         }
     }
     let stats = controller.stats();
-    let whole = stats.acted + 1 >= u32::from(CYCLES) && stats.stale == 0 && stats.malformed == 0;
+    let whole =
+        armed && controller.armed() && stats.acted + 1 >= u32::from(CYCLES) && stats.stale == 0 && stats.malformed == 0;
     if !whole || controller.heard().count_ones() != u32::from(modules) || stats.deadline_misses != 0 {
         hprintln!("the controller among {} modules did not take part in every cycle: {:?}", modules, stats);
         debug::exit(debug::EXIT_FAILURE);
