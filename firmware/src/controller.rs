@@ -1034,7 +1034,7 @@ impl<'a> Controller<'a> {
                 self.next_sync = Some(if next > now { next } else { now.saturating_add(self.period()) });
                 self.send_sync(self.cycle.wrapping_add(1), sensors);
             }
-        } else if now >= self.takeover_at() {
+        } else if now >= self.takeover_not_before() && now >= self.takeover_at() {
             up(&mut self.stats.takeovers);
             self.time_keeper = Some(node);
             let period = self.period();
@@ -1069,6 +1069,11 @@ impl<'a> Controller<'a> {
         self.failsafe.set(Fault::ModuleCount, false);
         self.outbox.sync = Some(Sync::new(cycle, self.alive_count(), self.config.modules));
         self.start_cycle(cycle, sensors);
+    }
+
+    /// A moment before which no module takes over. Cheap: the modules before this one in line need not be counted.
+    fn takeover_not_before(&self) -> Micros {
+        self.last_sync.saturating_add(self.periods(self.config.timing.takeover_periods))
     }
 
     /// When this module takes over from a silent time-keeper: later for each live module before it in line.
@@ -1310,7 +1315,8 @@ impl<'a> Controller<'a> {
     /// The next moment at which something happens without a frame.
     fn deadline(&self) -> Micros {
         let timing = &self.config.timing;
-        let mut deadline = self.now.saturating_add(self.period().min(u64::from(timing.poll_within_us)));
+        let latest = self.now.saturating_add(self.period().min(u64::from(timing.poll_within_us)));
+        let mut deadline = latest;
         let mut at = |moment: Micros| {
             if moment > self.now {
                 deadline = deadline.min(moment);
@@ -1318,7 +1324,8 @@ impl<'a> Controller<'a> {
         };
         match self.next_sync {
             Some(due) => at(due),
-            None => at(self.takeover_at()),
+            None if self.takeover_not_before() < latest => at(self.takeover_at()),
+            None => {}
         }
         if let Some(start) = self.cycle_start {
             match self.phase {

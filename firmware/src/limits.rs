@@ -164,8 +164,10 @@ impl Joints {
     /// Takes the latest sample. Answers whether it says anything new: frames come faster than samples.
     #[inline]
     pub fn follow(&mut self, sensors: &Sensors) -> bool {
-        let same = |last: [f32; MAX_JOINTS]| last.iter().zip(&sensors.joint_angles).all(|(a, b)| a == b);
-        if self.last.is_some_and(same) {
+        let differ = |last: &[f32; MAX_JOINTS]| {
+            last.iter().zip(&sensors.joint_angles).fold(0, |differ, (a, b)| differ | (a.to_bits() ^ b.to_bits()))
+        };
+        if self.last.as_ref().is_some_and(|last| differ(last) == 0) {
             return false;
         }
         self.follow_news(sensors);
