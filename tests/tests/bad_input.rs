@@ -209,7 +209,7 @@ fn a_run_survives_kill_and_other_folders_other_robots_and_full_disks_are_refused
 #[test]
 fn help_is_there_for_every_verb() {
     let folder = tempfile::tempdir().unwrap();
-    for verb in ["train", "eval", "export", "sil", "flash", "bench", "dbc"] {
+    for verb in ["train", "eval", "export", "sil", "flash", "bench", "dbc", "bus"] {
         let output = snakectl(folder.path(), &[verb, "--help"]);
         assert!(output.status.success() && String::from_utf8_lossy(&output.stdout).contains("Usage"));
     }

@@ -7,7 +7,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::Output;
 
-use common::{command, refuse};
+use common::{arm_image, command, refuse};
 use composer_firmware::failsafe::BusOffPolicy;
 use composer_firmware::limits::{Caps, JointRange};
 use composer_firmware::memory_map::{FLASH_ADDRESS, NODE_PAGE_ADDRESS, POLICY_ADDRESS};
@@ -32,22 +32,6 @@ if [ "$1" = download ]; then
 fi
 "#;
 
-/// An ARM program of 16 bytes that is loaded to `address`.
-fn image(address: u32) -> Vec<u8> {
-    let mut bytes = Vec::new();
-    bytes.extend(b"\x7fELF\x01\x01\x01\0\0\0\0\0\0\0\0\0");
-    let half = |value: u16| value.to_le_bytes();
-    let word = |value: u32| value.to_le_bytes();
-    // An executable for ARM; entry, program headers at 52, no sections; 52 bytes of header, one program header of 32.
-    bytes.extend([half(2), half(40)].concat());
-    bytes.extend([word(1), word(address), word(52), word(0), word(0x0500_0000)].concat());
-    bytes.extend([half(52), half(32), half(1), half(40), half(0), half(0)].concat());
-    // To be loaded: offset, virtual and physical address, size in file and memory, readable and executable, alignment.
-    bytes.extend([word(1), word(84), word(address), word(address), word(16), word(16), word(5), word(4)].concat());
-    bytes.extend([0; 16]);
-    bytes
-}
-
 struct Bench {
     folder: tempfile::TempDir,
 }
@@ -61,7 +45,7 @@ impl Bench {
         let tool = bench.path().join("tools/probe-rs");
         std::fs::set_permissions(tool, PermissionsExt::from_mode(0o755)).unwrap();
         bench.write("tools/probes", b"The following debug probes were found:\n[0]: STLINK-V3 -- 0483:374e (ST-LINK)\n");
-        bench.write("module.elf", &image(FLASH_ADDRESS));
+        bench.write("module.elf", &arm_image(FLASH_ADDRESS));
         bench
     }
 
@@ -248,11 +232,11 @@ fn what_cannot_be_a_module_is_refused_before_anything_is_written() {
         refuse(bench.path(), &["flash", "--dry-run", "--node", "0", "--image", "other.elf"], words);
     };
     // The emulated board's image begins at 0; one that is too long would reach into the policy.
-    image_at(&image(0), &["not for this board", "0x08000000"]);
-    image_at(&image(POLICY_ADDRESS - 8), &["not for this board"]);
+    image_at(&arm_image(0), &["not for this board", "0x08000000"]);
+    image_at(&arm_image(POLICY_ADDRESS - 8), &["not for this board"]);
     image_at(b"", &["no ARM program"]);
-    image_at(&image(FLASH_ADDRESS)[..70], &["no ARM program"]);
-    let mut x86 = image(FLASH_ADDRESS);
+    image_at(&arm_image(FLASH_ADDRESS)[..70], &["no ARM program"]);
+    let mut x86 = arm_image(FLASH_ADDRESS);
     x86[18] = 3;
     image_at(&x86, &["no ARM program"]);
     refuse(bench.path(), &["flash", "--dry-run", "--node", "0"], &["there is no image", "cargo image-stm32g474"]);

@@ -3,6 +3,8 @@
 //! A [`Transport`] carries frames: [SocketCAN](socketcan) or a serial adapter with the [slcan](serial) protocol, which may also be the pseudo-terminal
 //! of `snakectl sil --live`. [`Robot`] makes of the frames what one knows of each module, [`Station`] asks and commands. Nothing here prints.
 
+pub mod calibrate;
+pub mod config;
 pub mod monitor;
 pub mod registers;
 mod robot;
@@ -20,7 +22,7 @@ use std::time::Duration;
 use composer_shared::wire::{Frame, ServiceCode};
 
 pub use robot::{Change, Module, Robot, SILENT_CYCLES, fault_name};
-pub use station::{Answer, Drive, Station};
+pub use station::{Answer, Drive, LogEntry, Station};
 
 /// What carries frames to and from a bus.
 pub trait Transport: Send {

@@ -253,8 +253,8 @@ impl Robot {
     /// Looks at the clock: who has fallen silent? To be asked when no frame waits to be heard.
     pub fn look(&mut self, at: Duration) -> Vec<Change> {
         let period = self.period();
-        // Without a time-keeper nobody sends STATE, but HEARTBEAT goes on.
-        let beating = self.sync.is_some_and(|(.., then)| at.saturating_sub(then) < period * SILENT_CYCLES);
+        // Without a time-keeper nobody sends STATE, but HEARTBEAT goes on. When the whole bus pauses, nobody in particular is gone.
+        let beating = self.sync.is_some_and(|(.., then)| at.saturating_sub(then) < period * 3 / 2);
         let patience = period * if beating { SILENT_CYCLES } else { HEARTBEAT_CYCLES * SILENT_CYCLES };
         self.who_is_gone(|module| module.heard.is_some_and(|heard| at.saturating_sub(heard) >= patience))
     }

@@ -5,11 +5,11 @@ use std::time::Duration;
 
 use composer_shared::registers::Register;
 use composer_shared::wire::{
-    ALL_MODULES, EmergencyStop, Frame, Function, Goal, Health, Message, Operation, STATION, ServiceCode,
-    ServiceRequest, ServiceResponse, StopCommand, StopCount,
+    ALL_MODULES, EmergencyStop, Fault, Frame, Goal, Health, Message, Operation, STATION, ServiceCode, ServiceRequest,
+    ServiceResponse, StopCommand, StopCount,
 };
 
-use super::robot::{Change, Robot};
+use super::robot::{Change, Robot, fault_name};
 use super::{BusError, Transport};
 
 /// How long a module may take to answer: a frame waits for a cycle's traffic at most.
@@ -353,6 +353,100 @@ impl Station {
         )))
     }
 
+    /// Who a module is, for people: names and values.
+    pub fn hello(&mut self, node: u8) -> Result<Vec<(&'static str, String)>, BusError> {
+        let mut item = |index| self.request(node, Operation::Hello, index, 0);
+        let [protocol, firmware, page, modules] = item(0)?.to_le_bytes();
+        let unique_id = [item(1)?, item(2)?, item(3)?];
+        let policy = item(4)?;
+        let [reason, resets, low, high] = item(5)?.to_le_bytes();
+        Ok(vec![
+            ("protocol", protocol.to_string()),
+            ("firmware", format!("{}.{}", firmware >> 4, firmware & 15)),
+            ("node page", format!("layout {page}")),
+            ("modules", modules.to_string()),
+            ("unique id", chip(unique_id)),
+            ("policy", format!("{policy:08x} (tag {:04x})", policy as u16)),
+            ("last start", format!("reason {reason}, {resets} in a row that nobody asked for")),
+            ("starts", u16::from_le_bytes([low, high]).to_string()),
+        ])
+    }
+
+    /// The fault log of a module, the newest entry first.
+    pub fn log(&mut self, node: u8) -> Result<Vec<LogEntry>, BusError> {
+        let mut entries = Vec::new();
+        for back in 0..=u8::MAX {
+            let Answer { code, value: number } = self.answer_of(node, Operation::Log, back, 0)?;
+            if code == ServiceCode::NoSuchRegister as u8 {
+                break;
+            }
+            if code != ServiceCode::Ok as u8 {
+                return Err(BusError::Refused { node, what: Operation::Log.name().into(), code });
+            }
+            let time_ms = self.request(node, Operation::Log, back, 1)?;
+            let what = self.request(node, Operation::Log, back, 2)?;
+            let data = self.request(node, Operation::Log, back, 3)? as u16;
+            entries.push(LogEntry { number, boot: what as u16, time_ms, fault: (what >> 16) as u8, data });
+        }
+        Ok(entries)
+    }
+
+    /// Gives a module another number, which counts from its next start on. Where two have the same, `unique_id` says which is meant. Gives its chip, and whether
+    /// it answered: one that is silent because of its twin obeys, but says nothing.
+    pub fn renumber(&mut self, node: u8, number: u8, unique_id: Option<&str>) -> Result<(String, bool), BusError> {
+        let words = match unique_id {
+            Some(text) => unchip(text).ok_or_else(|| {
+                BusError::Refusal(format!(
+                    "`{text}` is no unique identifier: three words of eight hexadecimal digits, as `hello` prints them"
+                ))
+            })?,
+            None => {
+                let mut words = [0; 3];
+                for (word, index) in words.iter_mut().zip(1..) {
+                    *word = self.request(node, Operation::Hello, index, 0)?;
+                }
+                words
+            }
+        };
+        // Everybody is asked, and all but the one with this chip say that it is not theirs.
+        let mut meant = None;
+        for (index, word) in (0..).zip(words) {
+            let ok = |_, response: &ServiceResponse| response.code == ServiceCode::Ok as u8;
+            meant = self.ask_for(Operation::SetNode, index, word, ok)?.map(|(from, _)| from);
+        }
+        if meant.is_none() && unique_id.is_none() {
+            return Err(BusError::Silent { node, heard: self.robot.present().contains(&node) });
+        }
+        let answer = self.ask_for(Operation::SetNode, 3, number.into(), |from, _| Some(from) == meant)?;
+        match answer {
+            Some((node, ServiceResponse { code, .. })) if code != ServiceCode::Ok as u8 => {
+                Err(BusError::Refused { node, what: format!("the number {number}"), code })
+            }
+            answer => Ok((chip(words), answer.is_some())),
+        }
+    }
+
+    /// Asks all modules, and waits for the answer that is wanted.
+    fn ask_for(
+        &mut self,
+        operation: Operation,
+        index: u8,
+        value: u32,
+        wanted: impl Fn(u8, &ServiceResponse) -> bool,
+    ) -> Result<Option<(u8, ServiceResponse)>, BusError> {
+        let sequence = self.ask(ALL_MODULES, operation, index, value)?;
+        let start = self.now();
+        while let Some(left) = patience(operation).checked_sub(self.now() - start) {
+            if let Some((from, response)) = self.listen(left)?.as_ref().and_then(Self::answer)
+                && (response.operation, response.sequence) == (operation as u8, sequence)
+                && wanted(from, &response)
+            {
+                return Ok(Some((from, response)));
+            }
+        }
+        Ok(None)
+    }
+
     /// Asks all modules for their supply; those that do not answer at once have none.
     pub fn look_at_supply(&mut self) -> Result<(), BusError> {
         let operation = Operation::Read;
@@ -379,13 +473,12 @@ impl Station {
         let mut armed = self.now();
         while !ended(self) {
             let frame = self.listen(Duration::from_millis(10))?;
-            if let (Some(frame), Some(goal)) = (&frame, drive.goal)
-                && frame.function() == Some(Function::Sync)
-                && let Ok(Message::Sync(sync)) = Message::parse(frame)
+            // A goal that is not known is said, too: it is the station's sign of life.
+            if let Some(Ok(Message::Sync(sync))) = frame.as_ref().map(Message::parse)
                 && self.answered != Some(sync.cycle)
             {
                 self.answered = Some(sync.cycle);
-                self.send(&Message::Goal(Goal::new(sync.cycle as u8, 0, Some(goal))))?;
+                self.send(&Message::Goal(Goal::new(sync.cycle as u8, 0, drive.goal)))?;
             }
             if drive.arm && self.now() >= armed + ARM_AGAIN {
                 armed = self.now();
@@ -394,4 +487,55 @@ impl Station {
         }
         Ok(())
     }
+}
+
+/// An entry of a module's fault log.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LogEntry {
+    /// Its number; it never changes.
+    pub number: u32,
+    /// In which start of the module.
+    pub boot: u16,
+    /// Time since that start, ms.
+    pub time_ms: u32,
+    /// Number of the fault; 0: the module started.
+    pub fault: u8,
+    /// Depends on the fault.
+    pub data: u16,
+}
+
+impl std::fmt::Display for LogEntry {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let LogEntry { number, boot, time_ms, fault, data } = *self;
+        write!(f, "{number:5}  start {boot}, {:10.3} s  ", f64::from(time_ms) / 1e3)?;
+        match Fault::from_number(fault) {
+            None if fault == 0 => {
+                let [reason, resets] = data.to_le_bytes();
+                write!(f, "the module started: reason {reason}, {resets} in a row that nobody asked for")
+            }
+            Some(Fault::OverTemperature) => write!(f, "{}: {:.1} C", fault_name(fault), f32::from(data as i16) / 10.0),
+            Some(Fault::UnderVoltage | Fault::OverVoltage) => {
+                write!(f, "{}: {:.2} V", fault_name(fault), f32::from(data) / 1e3)
+            }
+            Some(Fault::Sensors) => write!(f, "{}: encoders without a reading {data:04b}", fault_name(fault)),
+            Some(Fault::OverCurrent) => write!(f, "{}: motors cut off {data:02b}", fault_name(fault)),
+            _ => write!(f, "{} in cycle {data}", fault_name(fault)),
+        }
+    }
+}
+
+/// A chip's unique identifier as people read it.
+fn chip(words: [u32; 3]) -> String {
+    words.map(|word| format!("{word:08x}")).join("-")
+}
+
+/// The same back.
+fn unchip(text: &str) -> Option<[u32; 3]> {
+    let words: Vec<u32> = text
+        .split('-')
+        .filter(|word| word.len() == 8)
+        .map(|word| u32::from_str_radix(word, 16))
+        .collect::<Result<_, _>>()
+        .ok()?;
+    words.try_into().ok()
 }

@@ -1,16 +1,23 @@
 //! `snakectl bus`: watches and commands a robot on its bus.
 
 use std::io::{IsTerminal, Write};
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use anyhow::{Result, bail};
+use anyhow::{Context, Result, bail};
 use composer_shared::registers::{Name, Register};
 use composer_shared::robot::MAX_MODULES;
 use composer_shared::wire::Operation;
 
+use crate::bus::calibrate::{Axis, Bench, Jog, Turned};
+use crate::bus::config::{self, Restored, RobotFile};
 use crate::bus::monitor::{json_change, json_state, table};
 use crate::bus::{Address, BusError, Drive, Station, registers};
+use crate::files::write_whole;
+
+/// How long `identify` flashes a light.
+const IDENTIFY_SECONDS: u32 = 10;
 
 /// Arguments of `bus`.
 #[derive(clap::Args, Clone, Debug)]
@@ -37,6 +44,19 @@ enum Verb {
     Goal(Goal),
     /// One module: its registers, fault log, light, and a careful movement
     Node(Node),
+    /// Write the configuration of the whole robot as TOML
+    Dump {
+        /// File [default: print it]
+        #[arg(short, long, value_name = "FILE")]
+        output: Option<PathBuf>,
+    },
+    /// Write a configuration to the robot that it is of, and store it
+    Restore {
+        /// The file
+        file: PathBuf,
+    },
+    /// Calibrate one module on the bench; `--store` keeps what was found
+    Calibrate(Calibrate),
 }
 
 #[derive(clap::Args, Clone, Debug)]
@@ -110,12 +130,122 @@ enum NodeVerb {
     },
     /// Keep what was written through a loss of power
     Store,
+    /// Who it is: versions, unique identifier, policy, why it started
+    Hello,
+    /// Print its fault log, the newest entry first
+    Log {
+        /// Forget the log
+        #[arg(long)]
+        clear: bool,
+    },
+    /// Give it another number; counts from its next start on
+    Number {
+        /// The new number
+        number: u8,
+        /// Unique identifier of the chip (as `hello` prints it), where two modules have the same number
+        #[arg(long, value_name = "ID")]
+        unique_id: Option<String>,
+    },
+    /// Drive one axis for a moment
+    Jog {
+        /// Which
+        #[arg(value_enum)]
+        axis: Axis,
+        #[command(flatten)]
+        how: How,
+        /// The other way
+        #[arg(long)]
+        back: bool,
+    },
     /// Flash the module's light
     Identify,
     /// Clear the faults that a person may clear
     Clear,
     /// Restart the module
     Restart,
+}
+
+/// How strong and how long a jog is.
+#[derive(clap::Args, Clone, Copy, Debug)]
+struct How {
+    /// Current, as a part of the motor's largest; at most a half
+    #[arg(long, value_name = "PART", default_value_t = Jog::default().part)]
+    current: f32,
+    /// Time, s; at most 2
+    #[arg(long, value_name = "S", default_value_t = Jog::default().time.as_secs_f32())]
+    time: f32,
+}
+
+impl How {
+    fn jog(self) -> Result<Jog> {
+        if !(0.01..=0.5).contains(&self.current) {
+            bail!("--current is 0.01 to 0.5 of the motor's largest current");
+        }
+        if !(0.05..=2.0).contains(&self.time) {
+            bail!("--time is 0.05 to 2 s");
+        }
+        Ok(Jog { part: self.current, time: Duration::from_secs_f32(self.time) })
+    }
+}
+
+#[derive(clap::Args, Clone, Debug)]
+struct Calibrate {
+    /// Number of the module
+    #[arg(value_parser = clap::value_parser!(u8).range(0..MAX_MODULES as i64))]
+    node: u8,
+    #[command(subcommand)]
+    what: What,
+    /// Keep what was found through a loss of power
+    #[arg(long, global = true)]
+    store: bool,
+}
+
+#[derive(clap::Subcommand, Clone, Debug)]
+enum What {
+    /// The module lies flat: correct the mounting of its inertial sensor
+    Level,
+    /// Find the mounting of its inertial sensor from two poses, for which it asks
+    Imu,
+    /// Its joints are straight as they are: make that their zero
+    Zero {
+        /// Which joints, 0 nearest the head [default: all four]
+        #[arg(long, value_name = "J", value_parser = clap::value_parser!(u8).range(0..4))]
+        joint: Vec<u8>,
+    },
+    /// Drive an axis and find out which way motor and encoders turn
+    Polarity {
+        /// Which
+        #[arg(value_enum)]
+        axis: Axis,
+        #[command(flatten)]
+        how: How,
+        /// Which way the rear turned, if it was seen before; without it the question is asked
+        #[arg(long, value_enum, value_name = "WAY")]
+        turned: Option<Way>,
+    },
+    /// Drive an axis both ways, gently, until it goes no further, and set the limits of its joints inside of that
+    Range {
+        /// Which
+        #[arg(value_enum)]
+        axis: Axis,
+        #[command(flatten)]
+        how: How,
+        /// Go no further than this, rad
+        #[arg(long, default_value_t = 2.8)]
+        guard: f32,
+        /// Distance of the limits from the ends, rad
+        #[arg(long, default_value_t = 0.05)]
+        margin: f32,
+    },
+}
+
+/// Which way the rear end of a module turned.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum Way {
+    Left,
+    Right,
+    Down,
+    Up,
 }
 
 /// Runs the verb.
@@ -160,6 +290,32 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             session(&mut station, &Drive { arm: *arm, goal: Some(goal) }, seconds, &ended)
         }
         Verb::Node(Node { node, verb }) => one(&mut station, *node, verb),
+        Verb::Dump { output } => {
+            let text = config::dump(&mut station)?.to_toml();
+            match output {
+                Some(path) => write_whole(path, text.as_bytes()),
+                None => Ok(print!("{text}")),
+            }
+        }
+        Verb::Restore { file } => {
+            let text = std::fs::read_to_string(file).with_context(|| format!("cannot read {}", file.display()))?;
+            let robot = RobotFile::parse(&text).with_context(|| file.display().to_string())?;
+            let Restored { changed, same } =
+                config::restore(&mut station, &robot).with_context(|| file.display().to_string())?;
+            for (node, registers) in &changed {
+                println!("module {node}: {registers} registers written and stored");
+            }
+            if !same.is_empty() {
+                println!("{}: as in the file already", list(&same));
+            }
+            if !changed.is_empty() {
+                println!(
+                    "it counts from the next start of the modules on: `node N restart`, or switch the robot off and on"
+                );
+            }
+            Ok(())
+        }
+        Verb::Calibrate(options) => calibrate(&mut station, options),
     }
 }
 
@@ -182,6 +338,8 @@ fn list(nodes: &[u8]) -> String {
 /// Drives the robot until Ctrl-C, which stops it, or for some time, after which it is disarmed if it was to be armed.
 fn session(station: &mut Station, drive: &Drive, seconds: Option<Duration>, ended: &AtomicBool) -> Result<()> {
     let start = Instant::now();
+    // Who is there was said already.
+    drop(station.changes());
     let over = || seconds.is_some_and(|seconds| start.elapsed() >= seconds);
     let result = station.drive(drive, |station| {
         for change in station.changes() {
@@ -280,13 +438,44 @@ fn one(station: &mut Station, node: u8, verb: &NodeVerb) -> Result<()> {
             let bits = station.request(node, Operation::Write, number, bits)?;
             println!("{} = {}", Name(number), registers::show(number, bits));
         }
+        NodeVerb::Hello => {
+            for (name, value) in station.hello(node)? {
+                println!("{name}: {value}");
+            }
+        }
+        NodeVerb::Log { clear: true } => {
+            station.request(node, Operation::ClearLog, 0, 0)?;
+            println!("module {node} has forgotten its fault log");
+        }
+        NodeVerb::Log { clear: false } => {
+            let entries = station.log(node)?;
+            if entries.is_empty() {
+                println!("the fault log of module {node} is empty");
+            }
+            for entry in entries {
+                println!("{entry}");
+            }
+        }
+        NodeVerb::Number { number, unique_id } => match station.renumber(node, *number, unique_id.as_deref())? {
+            (chip, true) => println!("chip {chip} is module {number} from its next start on (restart)"),
+            (chip, false) => println!(
+                "chip {chip} was told to be module {number}, and did not answer: it is silent because of its twin, or not there; switch it off and on, and look"
+            ),
+        },
+        NodeVerb::Jog { axis, how, back } => {
+            let jog = how.jog()?;
+            let ways = Bench::new(station, node).jog(*axis, jog, !back)?;
+            for (joint, way) in axis.joints().iter().zip(ways) {
+                println!("joint {joint} went {way:+.3} rad");
+            }
+        }
         NodeVerb::Store => {
-            station.request(node, Operation::Store, 0, 0)?;
+            config::store(station, node)?;
             println!("module {node} has stored its node page; it counts from the next start on (restart)");
         }
         NodeVerb::Identify => {
-            station.request(node, Operation::Identify, 0, 0)?;
-            println!("the light of module {node} flashes");
+            station.request(node, Operation::Identify, 0, IDENTIFY_SECONDS)?;
+            println!("the light of module {node} flashes for {IDENTIFY_SECONDS} s");
         }
         NodeVerb::Clear => {
             station.request(node, Operation::Clear, 0, 0)?;
@@ -298,4 +487,100 @@ fn one(station: &mut Station, node: u8, verb: &NodeVerb) -> Result<()> {
         }
     }
     Ok(())
+}
+
+fn calibrate(station: &mut Station, options: &Calibrate) -> Result<()> {
+    let node = options.node;
+    let mut bench = Bench::new(station, node);
+    match &options.what {
+        What::Level => {
+            let by = bench.level()?;
+            println!(
+                "module {node}: the mounting of the inertial sensor was corrected by {:.1} degrees",
+                by.to_degrees()
+            );
+        }
+        What::Imu => {
+            let by = bench.imu(|pose| answer(&format!("{pose}, then press Enter")).map(|_| ()))?;
+            println!(
+                "module {node}: the mounting of the inertial sensor is {:.1} degrees from what it was",
+                by.to_degrees()
+            );
+        }
+        What::Zero { joint } => {
+            let joints: &[u8] = if joint.is_empty() { &[0, 1, 2, 3] } else { joint };
+            for (joint, before, now) in bench.zero(joints)? {
+                println!("joint {joint}: zero is {now}, was {before}");
+            }
+        }
+        What::Polarity { axis, how, turned } => {
+            let fits = match axis {
+                Axis::Yaw => [Way::Left, Way::Right],
+                Axis::Pitch => [Way::Down, Way::Up],
+            };
+            if turned.is_some_and(|way| !fits.contains(&way)) {
+                bail!("the yaw axis turns left or right, the pitch axis down or up");
+            }
+            let found = bench.polarity(*axis, how.jog()?, || {
+                let way = match turned {
+                    Some(way) => *way,
+                    None => asked(*axis)?,
+                };
+                Ok(if matches!(way, Way::Left | Way::Down) { Turned::Positive } else { Turned::Negative })
+            })?;
+            let motor = if found.swap_motor {
+                "turned round: its torque constant has the other sign now"
+            } else {
+                "as configured"
+            };
+            println!("motor: {motor}");
+            for joint in axis.joints() {
+                let swapped = found.swap_encoder[usize::from(joint)];
+                println!(
+                    "encoder of joint {joint}: {}",
+                    if swapped { "counted the other way, corrected" } else { "as configured" }
+                );
+            }
+        }
+        What::Range { axis, how, guard, margin } => {
+            if !(0.1..=3.1).contains(guard) || !(0.0..=1.0).contains(margin) {
+                bail!("--guard is 0.1 to 3.1 rad, --margin 0 to 1 rad");
+            }
+            for (joint, low, high) in bench.range(*axis, how.jog()?, *guard, *margin)? {
+                println!("joint {joint}: {low:.3} to {high:.3} rad");
+            }
+        }
+    }
+    if options.store {
+        config::store(station, node)?;
+        println!("stored; it counts from the next start on (restart)");
+    } else {
+        println!("not stored yet: `node {node} store` keeps it, `node {node} restart` forgets it");
+    }
+    Ok(())
+}
+
+/// Asks which way the rear end turned.
+fn asked(axis: Axis) -> Result<Way, BusError> {
+    let (first, second) = if axis == Axis::Yaw { ("left", "right") } else { ("down", "up") };
+    loop {
+        let text = answer(&format!("which way did the rear end turn, {first} or {second}?"))?;
+        match text.trim() {
+            "left" | "l" if axis == Axis::Yaw => return Ok(Way::Left),
+            "right" | "r" if axis == Axis::Yaw => return Ok(Way::Right),
+            "down" | "d" if axis == Axis::Pitch => return Ok(Way::Down),
+            "up" | "u" if axis == Axis::Pitch => return Ok(Way::Up),
+            _ => {}
+        }
+    }
+}
+
+/// A line that somebody types.
+fn answer(question: &str) -> Result<String, BusError> {
+    eprintln!("{question}");
+    let mut line = String::new();
+    match std::io::stdin().read_line(&mut line) {
+        Ok(length) if length > 0 => Ok(line),
+        _ => Err(BusError::Interrupted),
+    }
 }
