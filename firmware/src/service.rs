@@ -259,15 +259,16 @@ impl Service {
     /// The next answer to send.
     #[inline(never)] // Like `poll`.
     pub fn next_frame(&mut self, controller: &Controller<'_>) -> Option<Frame> {
+        // Most of the time there is none.
+        let first = self.answers.first().copied().flatten()?;
         if controller.silenced() {
             self.answers = [None; ANSWERS];
             return None;
         }
         let mut moved = [None; ANSWERS];
-        let [first, rest @ ..] = self.answers;
-        moved.iter_mut().zip(rest).for_each(|(to, from)| *to = from);
+        moved.iter_mut().zip(self.answers.iter().skip(1)).for_each(|(to, from)| *to = *from);
         self.answers = moved;
-        Some(Message::ServiceResponse(first?).emit(self.node, self.fd))
+        Some(Message::ServiceResponse(first).emit(self.node, self.fd))
     }
 
     /// Whether something is on its way into the flash. It goes on with every poll, or with [`Service::work`].
@@ -324,6 +325,9 @@ impl Service {
 
     /// Does one thing with the flash, if there is something to do.
     pub fn work(&mut self, controller: &Controller<'_>, board: &mut impl Board) {
+        if self.saving.is_none() && self.log.is_idle() {
+            return;
+        }
         let may_erase = !controller.armed() && controller.mode() != Mode::Service;
         let Some((save, job)) = self.saving.as_mut().filter(|_| may_erase) else {
             return self.log.work(board.storage(), may_erase);

@@ -172,6 +172,8 @@ pub struct FaultLog {
     ready: bool,
     /// Sections that are still to be erased because the log is to be forgotten.
     clearing: u8,
+    /// Entries that a section has room for.
+    places: u32,
     waiting: [Entry; WAITING],
     count: usize,
     lost: u32,
@@ -188,6 +190,7 @@ impl FaultLog {
             place: 0,
             ready: false,
             clearing: 0,
+            places: places(flash),
             waiting: [Entry::default(); WAITING],
             count: 0,
             lost: 0,
@@ -245,6 +248,16 @@ impl FaultLog {
         self.count > 0 || self.clearing > 0
     }
 
+    /// Whether [`FaultLog::work`] has nothing to do: nothing is on its way, and there is room for more.
+    pub fn is_idle(&self) -> bool {
+        !self.is_busy() && (self.ready || self.place < self.spare())
+    }
+
+    /// From this place on there should be room in the other section. A quarter is spare, so that a robot that is armed for long has room.
+    fn spare(&self) -> u32 {
+        self.places - self.places / 4
+    }
+
     /// Adds an entry; it is written by [`FaultLog::work`].
     pub fn push(&mut self, time_ms: u32, fault: u8, data: u16) {
         match self.waiting.get_mut(self.count) {
@@ -265,7 +278,6 @@ impl FaultLog {
 
     /// Does one thing that is due: writes one entry, or erases one section, if that may be now.
     pub fn work<F: NorFlash>(&mut self, flash: &mut F, may_erase: bool) {
-        let places = places(flash);
         if self.clearing > 0 {
             if may_erase {
                 // First the one with the newest entries, so that a log that was cleared in part does not seem to go on.
@@ -273,13 +285,12 @@ impl FaultLog {
             }
             return;
         }
-        if self.place >= places && self.ready {
+        if self.place >= self.places && self.ready {
             self.section ^= 1;
             self.place = 0;
             self.ready = false;
         }
-        // A quarter is spare, so that a robot that is armed for long has room.
-        if may_erase && !self.ready && self.place >= places - places / 4 {
+        if may_erase && !self.ready && self.place >= self.spare() {
             if erase(flash, self.section ^ 1).is_ok() {
                 self.ready = true;
             } else {
@@ -287,7 +298,7 @@ impl FaultLog {
             }
             return;
         }
-        if self.place < places
+        if self.place < self.places
             && let [first, rest @ ..] = &self.waiting
             && self.count > 0
         {

@@ -13,16 +13,23 @@ use core::hint::black_box;
 
 use composer_firmware::attitude::Attitude;
 use composer_firmware::controller::{Boot, BusKind, Config, Controller};
-use composer_firmware::failsafe::BusStatus;
+use composer_firmware::failsafe::{BusOffPolicy, BusStatus};
+use composer_firmware::node_page::{Calibration, NodePage};
 use composer_firmware::power::Power;
+use composer_firmware::safety::Safety;
+use composer_firmware::service::{Board, Raw, Service};
+use composer_firmware::storage::RamFlash;
 use composer_firmware::supply::Extremes;
 use composer_shared::kinematics::Chain;
 use composer_shared::nn::Dense;
 use composer_shared::observation::{Seeker, Sensors, Told, observe};
 use composer_shared::policies;
 use composer_shared::policy::{Latent, Policy};
+use composer_shared::registers::Register;
 use composer_shared::robot::{Geometry, MAX_MODULES};
-use composer_shared::wire::{Frame, Goal, Health, LatentMessage, Message, STATION, State, Sync};
+use composer_shared::wire::{
+    Frame, Goal, Health, LatentMessage, Message, Operation, STATION, ServiceRequest, State, Sync,
+};
 use cortex_m::peripheral::SYST;
 use cortex_m::peripheral::syst::SystClkSource;
 use cortex_m_rt::entry;
@@ -180,6 +187,61 @@ fn latent_message(policy: &Policy<'_>, cycle: u8, latent: Latent) -> LatentMessa
     }
 }
 
+/// What a service needs of a board.
+struct Bench(RamFlash<1024>);
+
+impl Board for Bench {
+    type Flash = RamFlash<1024>;
+
+    fn storage(&mut self) -> &mut Self::Flash {
+        &mut self.0
+    }
+
+    fn unique_id(&self) -> [u32; 3] {
+        [1, 2, 3]
+    }
+
+    fn raw(&self) -> Raw {
+        Raw::default()
+    }
+}
+
+/// The service: with a frame that is not for it, and with a request.
+fn service(policy: Policy<'_>, random: &mut Random) {
+    let Ok(mut controller) = Controller::new(Config::new(3, 8, BusKind::Fd, &policy), policy, Boot::default(), 0)
+    else {
+        return;
+    };
+    let page = NodePage {
+        node: 3,
+        modules: 8,
+        bus_off: BusOffPolicy::Recover,
+        safety: Safety::BOARD,
+        calibration: Calibration::NOMINAL,
+    };
+    let mut board = Bench(RamFlash::ERASED);
+    let mut service = Service::new(page, &mut controller, 0, &mut board);
+    let sensors = sensors(random);
+    while service.is_busy() {
+        service.work(&controller, &mut board);
+    }
+    let index = Register::DeadMan.spec().first;
+    let request = ServiceRequest { destination: 3, operation: Operation::Read as u8, sequence: 0, index, value: 0 };
+    let frames = [
+        ("idle", Message::State(State::new(1, Health::SENSORS_PLAUSIBLE, &[0.0; 4])).emit(2, true)),
+        ("read", Message::ServiceRequest(request).emit(STATION, true)),
+    ];
+    for (name, frame) in frames {
+        let mut now = 0;
+        let instructions = count(|| {
+            now += 1;
+            service.poll(now, &mut controller, &sensors, Some(black_box(&frame)), &mut board);
+            service.next_frame(&controller)
+        });
+        report(format_args!("service/{name}"), instructions);
+    }
+}
+
 /// Whole control steps of the last module among `modules`, fed with the frames of all others and of the station.
 fn control_steps(policy: Policy<'_>, modules: u8, random: &mut Random) {
     let node = modules - 1;
@@ -254,6 +316,7 @@ fn main() -> ! {
     match policies::shipped("goal-reaching").map(Policy::parse) {
         Some(Ok(policy)) => {
             parts(&policy, &mut random);
+            service(policy, &mut random);
             for modules in [8, 16, 32, 64] {
                 control_steps(policy, modules, &mut random);
             }
