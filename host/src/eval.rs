@@ -4,7 +4,6 @@
 //! with, no latent is missed, the snake has the robot's own length, and without `--fault` nothing is broken.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 use composer_shared::observation::Observation;
 use composer_sim_bridge::faults::ScheduledFault;
@@ -12,6 +11,7 @@ use composer_sim_bridge::faults::ScheduledFault;
 use crate::env::{EnvConfig, SnakeEnv};
 use crate::environment::{Environment, View};
 use crate::methods::mix;
+use crate::methods::workers::Workers;
 use crate::outcome::{Episode, Report};
 use crate::policy::Policy;
 
@@ -61,27 +61,12 @@ pub fn run_episode(
 }
 
 /// Runs `job(index)` for every index below `count` on `threads` threads and returns the results in order.
+///
+/// # Panics
+///
+/// If the system does not give so many threads.
 pub fn parallel<T: Send>(count: usize, threads: usize, job: impl Fn(usize) -> T + Sync) -> Vec<T> {
-    let next = AtomicUsize::new(0);
-    let mut results: Vec<(usize, T)> = std::thread::scope(|scope| {
-        let workers: Vec<_> = (0..threads.max(1))
-            .map(|_| {
-                scope.spawn(|| {
-                    let mut done = Vec::new();
-                    loop {
-                        let index = next.fetch_add(1, Ordering::Relaxed);
-                        if index >= count {
-                            return done;
-                        }
-                        done.push((index, job(index)));
-                    }
-                })
-            })
-            .collect();
-        workers.into_iter().flat_map(|w| w.join().expect("a worker thread does not panic")).collect()
-    });
-    results.sort_by_key(|r| r.0);
-    results.into_iter().map(|r| r.1).collect()
+    Workers::new(threads).expect("the system gives threads").map(count, job)
 }
 
 /// A set of episodes to run.

@@ -16,6 +16,7 @@ use composer_shared::policy::{
 };
 use composer_shared::robot::MAX_MODULES;
 
+use crate::methods::composer::float::FloatPolicy;
 use crate::network::{Dense, Network, NetworkError};
 
 /// Why a network cannot be frozen.
@@ -98,7 +99,8 @@ pub fn freeze(network: &Network, meta: &Meta, calibration: &[Vec<Observation>]) 
     if !network.attention {
         return image(network, meta, &Scales { key: [1.0; KEY], value: [1.0; VALUE], query: 1.0 });
     }
-    let samples = Samples::of(network, &steps);
+    let float = FloatPolicy::new(network);
+    let samples = Samples::of(&float, &steps);
     let trial = thin_out(calibration, TRIAL_STEPS);
     let mut best: Option<(f32, Vec<u8>)> = None;
     for key in COVERED {
@@ -107,7 +109,7 @@ pub fn freeze(network: &Network, meta: &Meta, calibration: &[Vec<Observation>]) 
             // Averaged over many values the clipping of one hardly shows, so every module alone is tried as well.
             let alone = trial.iter().flat_map(|step| step.chunks(1));
             let steps = trial.iter().map(|step| &step[..]).chain(alone);
-            let parity = compare(network, &Policy::parse(&image)?, steps);
+            let parity = compare(&float, &Policy::parse(&image)?, steps);
             // Rare large differences count too.
             let cost = parity.rms + parity.max / 4.0;
             if best.as_ref().is_none_or(|(least, _)| cost < *least) {
@@ -123,17 +125,17 @@ pub fn freeze(network: &Network, meta: &Meta, calibration: &[Vec<Observation>]) 
 /// # Panics
 /// If a step has more than 64 modules.
 pub fn parity(network: &Network, policy: &Policy, steps: &[Vec<Observation>]) -> Parity {
-    compare(network, policy, steps.iter().map(|step| &step[..]))
+    compare(&FloatPolicy::new(network), policy, steps.iter().map(|step| &step[..]))
 }
 
-fn compare<'a>(network: &Network, policy: &Policy, steps: impl Iterator<Item = &'a [Observation]>) -> Parity {
+fn compare<'a>(float: &FloatPolicy, policy: &Policy, steps: impl Iterator<Item = &'a [Observation]>) -> Parity {
     let mut differences = Vec::new();
     for observations in steps {
         let n = observations.len();
-        let mut float = vec![[0.0; OUT]; n];
-        network.act(observations, &vec![u64::MAX; n], &mut float, None);
+        let mut exact = vec![[0.0; OUT]; n];
+        float.act(observations, &vec![u64::MAX; n], &mut exact, None);
         let integer = act(policy, observations);
-        differences.extend(float.as_flattened().iter().zip(integer.as_flattened()).map(|(f, i)| (f - i).abs()));
+        differences.extend(exact.as_flattened().iter().zip(integer.as_flattened()).map(|(f, i)| (f - i).abs()));
     }
     differences.sort_by(f32::total_cmp);
     let samples = differences.len();
@@ -179,17 +181,17 @@ struct Samples {
 }
 
 impl Samples {
-    fn of(network: &Network, steps: &[&Vec<Observation>]) -> Self {
+    fn of(float: &FloatPolicy, steps: &[&Vec<Observation>]) -> Self {
         let mut samples = Samples {
             query: [const { Vec::new() }; KEY],
             key: [const { Vec::new() }; KEY],
             value: [const { Vec::new() }; VALUE],
         };
         let push = |to: &mut [Vec<f32>], from: &[f32]| to.iter_mut().zip(from).for_each(|(to, x)| to.push(x.abs()));
-        for encoded in steps.iter().flat_map(|step| network.encode(step)) {
-            push(&mut samples.query, &encoded.query);
-            push(&mut samples.key, &encoded.key);
-            push(&mut samples.value, &encoded.value);
+        for latent in steps.iter().flat_map(|step| float.latents(step)) {
+            push(&mut samples.query, &latent[..KEY]);
+            push(&mut samples.key, &latent[KEY..2 * KEY]);
+            push(&mut samples.value, &latent[2 * KEY..]);
         }
         let all = samples.query.iter_mut().chain(&mut samples.key).chain(&mut samples.value);
         all.for_each(|channel| channel.sort_by(f32::total_cmp));
@@ -357,7 +359,7 @@ mod tests {
         for step in steps(2, 100, 8) {
             let (mut actions, mut expected) = ([[0.0; 2]; 8], [0.0; 64]);
             let heard = [0b1010_0110; 8];
-            network.act(&step, &heard, &mut actions, Some(&mut expected));
+            FloatPolicy::new(&network).act(&step, &heard, &mut actions, Some(&mut expected));
             let encoded: Vec<_> = step.iter().map(|o| policy.encode(o)).collect();
             let mut latents = [Latent::ZERO; MAX_MODULES];
             (0..8).for_each(|j| latents[j] = encoded[j].latent);

@@ -3,6 +3,7 @@
 pub mod bus;
 pub mod bus_trial;
 pub mod campaign;
+pub mod classic;
 pub mod cli;
 pub mod env;
 pub mod environment;
@@ -28,3 +29,8 @@ pub mod stats;
 pub mod tasks;
 pub mod train;
 pub mod vary;
+
+/// The page about new methods, whose code is compiled and run.
+#[cfg(doctest)]
+#[doc = include_str!("../new-method.md")]
+pub struct NewMethod;

@@ -1,13 +1,8 @@
-//! The policy network in floating point: what training hands over, what evaluation runs, what [`crate::freeze`] turns
-//! into integers.
-//!
-//! Plain loops over several modules at once, which the compiler vectorises; no external mathematics, so the same inputs
-//! give the same bits on every machine. What a module computes alone (embedding, key, value) does not depend on how
-//! many others there are.
+//! The policy network of COMPOSER in floating point, as data: what training hands over, what
+//! [`FloatPolicy`](crate::methods::composer::float::FloatPolicy) runs, what [`crate::freeze`] turns into integers.
 
-use composer_shared::observation::{Observation, SIZE};
-use composer_shared::policy::{CLIP, EMBED, HIDDEN, HIDDEN_IN, KEY, OBS, OUT, VALUE};
-use composer_shared::robot::MAX_MODULES;
+use composer_shared::observation::SIZE;
+use composer_shared::policy::{EMBED, HIDDEN, HIDDEN_IN, KEY, OBS, OUT, VALUE};
 use serde::{Deserialize, Serialize};
 
 /// A fully connected layer.
@@ -79,62 +74,10 @@ pub enum NetworkError {
     },
 }
 
-/// What a module computes from its own observation.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Encoded {
-    /// Embedding e.
-    pub embedding: [f32; EMBED],
-    /// Query q.
-    pub query: [f32; KEY],
-    /// Key k.
-    pub key: [f32; KEY],
-    /// Value v.
-    pub value: [f32; VALUE],
-}
-
-impl Encoded {
-    const ZERO: Encoded = Encoded { embedding: [0.0; EMBED], query: [0.0; KEY], key: [0.0; KEY], value: [0.0; VALUE] };
-}
-
-/// Modules that the widest kernel works on at once.
-const LANES: usize = 8;
-
 impl Dense {
     /// A layer of zeros.
     pub fn zeros(inputs: usize, outputs: usize, bias: bool) -> Self {
         Dense { inputs, outputs, weights: vec![0.0; inputs * outputs], bias: vec![0.0; if bias { outputs } else { 0 }] }
-    }
-
-    /// `weights * input + bias` for `L` modules side by side. Every module's sum is added up in the order of the
-    /// inputs.
-    fn forward<const L: usize, const IN: usize, const OUT: usize>(&self, input: &[[f32; L]; IN]) -> [[f32; L]; OUT] {
-        const ROWS: usize = 4;
-        let mut out = [[0.0; L]; OUT];
-        let (rows, _) = self.weights.as_chunks::<IN>();
-        let (blocks, rest) = rows.as_chunks::<ROWS>();
-        let (out_blocks, out_rest) = out.as_chunks_mut::<ROWS>();
-        for (block, out) in blocks.iter().zip(out_blocks) {
-            let mut sums = [[0.0; L]; ROWS];
-            for (i, x) in input.iter().enumerate() {
-                for (sum, row) in sums.iter_mut().zip(block) {
-                    for (sum, x) in sum.iter_mut().zip(x) {
-                        *sum += row[i] * x;
-                    }
-                }
-            }
-            *out = sums;
-        }
-        for (row, sum) in rest.iter().zip(out_rest) {
-            for (weight, x) in row.iter().zip(input) {
-                for (sum, x) in sum.iter_mut().zip(x) {
-                    *sum += weight * x;
-                }
-            }
-        }
-        for (out, bias) in out.iter_mut().zip(&self.bias) {
-            out.iter_mut().for_each(|out| *out += bias);
-        }
-        out
     }
 }
 
@@ -185,175 +128,6 @@ impl Network {
             None => Ok(()),
         }
     }
-
-    /// What each module computes from its own observation. Without attention query, key and value are zero.
-    pub fn encode(&self, observations: &[Observation]) -> Vec<Encoded> {
-        let mut encoded = vec![Encoded::ZERO; observations.len()];
-        let mut rest = observations;
-        let mut to = &mut encoded[..];
-        while !rest.is_empty() {
-            let count = rest.len().min(LANES);
-            let (now, later) = rest.split_at(count);
-            let (to_now, to_later) = to.split_at_mut(count);
-            if count <= LANES / 2 {
-                self.encode_lanes::<{ LANES / 2 }>(now, to_now);
-            } else {
-                self.encode_lanes::<LANES>(now, to_now);
-            }
-            (rest, to) = (later, to_later);
-        }
-        encoded
-    }
-
-    fn encode_lanes<const L: usize>(&self, observations: &[Observation], encoded: &mut [Encoded]) {
-        let mut input = [[0.0; L]; OBS];
-        for (lane, observation) in observations.iter().enumerate() {
-            for (i, x) in observation.iter().enumerate() {
-                let z = (x - self.mean[i]) / self.std[i];
-                input[i][lane] = if z.is_nan() { 0.0 } else { z.clamp(-CLIP, CLIP) };
-            }
-        }
-        let mut embedding: [[f32; L]; EMBED] = self.encoder.forward(&input);
-        embedding.as_flattened_mut().iter_mut().for_each(|x| *x = tanh(*x));
-        scatter(&embedding, encoded, |to| &mut to.embedding);
-        if self.attention {
-            scatter::<L, KEY>(&self.query.forward(&embedding), encoded, |to| &mut to.query);
-            scatter::<L, KEY>(&self.key.forward(&embedding), encoded, |to| &mut to.key);
-            scatter::<L, VALUE>(&self.value.forward(&embedding), encoded, |to| &mut to.value);
-        }
-    }
-
-    /// The actions of all modules of one robot, yaw and pitch torque as a fraction of the limit, each within -1 to 1.
-    ///
-    /// `heard[i]` bit `j`: module `i` has the message of module `j`; its own bit is implied, bits beyond the last
-    /// module are ignored. `attention` receives the weights, row `i` for module `i`, row-major n x n; without attention
-    /// each module has all of its own.
-    ///
-    /// # Panics
-    /// If there are more than 64 modules, or if the slices' lengths differ.
-    pub fn act(
-        &self,
-        observations: &[Observation],
-        heard: &[u64],
-        actions: &mut [[f32; OUT]],
-        attention: Option<&mut [f32]>,
-    ) {
-        self.act_encoded(&self.encode(observations), heard, actions, attention);
-    }
-
-    /// [`Network::act`] from what [`Network::encode`] gave.
-    ///
-    /// # Panics
-    /// As [`Network::act`].
-    pub fn act_encoded(
-        &self,
-        encoded: &[Encoded],
-        heard: &[u64],
-        actions: &mut [[f32; OUT]],
-        mut attention: Option<&mut [f32]>,
-    ) {
-        let n = encoded.len();
-        assert!(n <= MAX_MODULES, "{n} modules, at most {MAX_MODULES} are possible");
-        assert!(heard.len() == n && actions.len() == n, "one mask and one action for each of {n} modules");
-        if let Some(weights) = &attention {
-            assert_eq!(weights.len(), n * n, "attention weights are {n} x {n}");
-        }
-        let mut at = 0;
-        while at < n {
-            let count = (n - at).min(LANES);
-            if count <= LANES / 2 {
-                self.act_lanes::<{ LANES / 2 }>(encoded, heard, at, &mut actions[at..at + count], &mut attention);
-            } else {
-                self.act_lanes::<LANES>(encoded, heard, at, &mut actions[at..at + count], &mut attention);
-            }
-            at += count;
-        }
-    }
-
-    fn act_lanes<const L: usize>(
-        &self,
-        encoded: &[Encoded],
-        heard: &[u64],
-        first: usize,
-        actions: &mut [[f32; OUT]],
-        attention: &mut Option<&mut [f32]>,
-    ) {
-        let n = encoded.len();
-        let mut input = [[0.0; L]; HIDDEN_IN];
-        for lane in 0..actions.len() {
-            let own = first + lane;
-            for (x, e) in input.iter_mut().zip(&encoded[own].embedding) {
-                x[lane] = *e;
-            }
-            let mut weights = [0.0; MAX_MODULES];
-            if self.attention {
-                let context = attend(encoded, own, heard[own] | 1 << own, &mut weights);
-                for (x, c) in input[EMBED..].iter_mut().zip(context) {
-                    x[lane] = c;
-                }
-            } else {
-                weights[own] = 1.0;
-            }
-            if let Some(attention) = attention {
-                attention[own * n..(own + 1) * n].copy_from_slice(&weights[..n]);
-            }
-        }
-        let mut hidden: [[f32; L]; HIDDEN] = self.hidden.forward(&input);
-        hidden.as_flattened_mut().iter_mut().for_each(|x| *x = tanh(*x));
-        let out: [[f32; L]; OUT] = self.output.forward(&hidden);
-        for (lane, action) in actions.iter_mut().enumerate() {
-            for (action, out) in action.iter_mut().zip(&out) {
-                *action = out[lane].clamp(-1.0, 1.0);
-            }
-        }
-    }
-}
-
-/// The context of module `own` and, in `weights`, whom it attends to.
-fn attend(encoded: &[Encoded], own: usize, mask: u64, weights: &mut [f32; MAX_MODULES]) -> [f32; VALUE] {
-    let present = |j: usize| mask >> j & 1 == 1;
-    let query = &encoded[own].query;
-    let mut largest = f32::NEG_INFINITY;
-    for (j, (weight, other)) in weights.iter_mut().zip(encoded).enumerate() {
-        if present(j) {
-            // Four partial sums, which the processor can work on at once.
-            let mut sums = [0.0f32; 4];
-            for (q, k) in query.as_chunks::<4>().0.iter().zip(other.key.as_chunks::<4>().0) {
-                for (sum, (q, k)) in sums.iter_mut().zip(q.iter().zip(k)) {
-                    *sum += q * k;
-                }
-            }
-            *weight = ((sums[0] + sums[1]) + (sums[2] + sums[3])) * const { 1.0 / 4.0 };
-            largest = largest.max(*weight);
-        }
-    }
-    const { assert!(KEY == 16, "the logits' scale is 1 / sqrt(KEY)") };
-    let mut context = [0.0; VALUE];
-    let mut total = 0.0;
-    for (j, (weight, other)) in weights.iter_mut().zip(encoded).enumerate() {
-        if present(j) {
-            *weight = exp(*weight - largest);
-            total += *weight;
-            for (c, v) in context.iter_mut().zip(&other.value) {
-                *c += *weight * v;
-            }
-        }
-    }
-    // The largest term is 1, so the total is at least that.
-    weights.iter_mut().chain(&mut context).for_each(|x| *x /= total);
-    context
-}
-
-fn scatter<const L: usize, const N: usize>(
-    from: &[[f32; L]; N],
-    encoded: &mut [Encoded],
-    field: impl Fn(&mut Encoded) -> &mut [f32; N],
-) {
-    for (lane, to) in encoded.iter_mut().enumerate() {
-        for (to, from) in field(to).iter_mut().zip(from) {
-            *to = from[lane];
-        }
-    }
 }
 
 fn finite<'a>(mut numbers: impl Iterator<Item = &'a f32>, what: impl Fn() -> String) -> Result<(), NetworkError> {
@@ -363,50 +137,11 @@ fn finite<'a>(mut numbers: impl Iterator<Item = &'a f32>, what: impl Fn() -> Str
     }
 }
 
-/// Hyperbolic tangent, off by at most 5e-7; without branches, so that it vectorises.
-///
-/// A rational minimax approximation, odd of degree 13 over even of degree 6 (that of the Eigen library).
-pub fn tanh(x: f32) -> f32 {
-    // Beyond this the approximation would leave -1 to 1 by rounding.
-    let x = x.clamp(-7.905_311, 7.905_311);
-    let y = x * x;
-    let p = -2.760_768_5e-16;
-    let p = p * y + 2.000_188e-13;
-    let p = p * y - 8.604_672e-11;
-    let p = p * y + 5.122_297e-8;
-    let p = p * y + 1.485_722_4e-5;
-    let p = p * y + 6.372_619_3e-4;
-    let p = p * y + 4.893_524_6e-3;
-    let q = 1.198_258_4e-6;
-    let q = q * y + 1.185_347e-4;
-    let q = q * y + 2.268_434_6e-3;
-    let q = q * y + 4.893_525e-3;
-    (x * p / q).clamp(-1.0, 1.0)
-}
-
-/// Exponential function for arguments up to 0, relative error at most 3e-7; below -87 it is about 1e-38.
-fn exp(x: f32) -> f32 {
-    // 2^n * e^r with |r| <= ln(2) / 2: adding 1.5 * 2^23 rounds to an integer and leaves it in the low bits.
-    const ROUND: f32 = 12_582_912.0;
-    let x = x.max(-87.0);
-    let shifted = x * core::f32::consts::LOG2_E + ROUND;
-    let n = shifted - ROUND;
-    // ln(2) in two parts, the first exact in few bits.
-    let r = (x - n * 0.693_359_4) - n * -2.121_944_4e-4;
-    let p = 1.0 / 720.0;
-    let p = p * r + 1.0 / 120.0;
-    let p = p * r + 1.0 / 24.0;
-    let p = p * r + 1.0 / 6.0;
-    let p = p * r + 0.5;
-    let p = p * r + 1.0;
-    let p = p * r + 1.0;
-    let exponent = shifted.to_bits().wrapping_sub(ROUND.to_bits()).wrapping_add(127);
-    p * f32::from_bits(exponent << 23)
-}
-
 #[cfg(test)]
 pub(crate) mod testing {
     //! Networks and observations that are random but of realistic size.
+
+    use composer_shared::observation::Observation;
 
     use super::*;
 
@@ -467,114 +202,8 @@ pub(crate) mod testing {
 
 #[cfg(test)]
 mod tests {
-    use super::testing::{observations, random_network};
+    use super::testing::random_network;
     use super::*;
-
-    #[test]
-    fn tanh_and_exp_are_accurate() {
-        let (mut worst_tanh, mut worst_exp) = (0.0f64, 0.0f64);
-        for i in -1_000_000..=1_000_000 {
-            let x = i as f32 * 1e-5;
-            worst_tanh = worst_tanh.max((f64::from(tanh(x)) - f64::from(x).tanh()).abs());
-            assert_eq!(tanh(-x), -tanh(x));
-        }
-        for i in 0..=870_000 {
-            let x = i as f32 * -1e-4;
-            worst_exp = worst_exp.max((f64::from(exp(x)) / f64::from(x).exp() - 1.0).abs());
-        }
-        println!("largest errors: tanh {worst_tanh:.1e}, exp {worst_exp:.1e} (relative)");
-        assert!(worst_tanh < 5e-7 && worst_exp < 3e-7);
-        assert_eq!((tanh(f32::INFINITY), tanh(-1e30), exp(0.0)), (1.0, -1.0, 1.0));
-        assert!(exp(f32::NEG_INFINITY) < 1e-37);
-    }
-
-    /// The equations, written down naively in double precision.
-    fn reference(network: &Network, observations: &[Observation], heard: &[u64]) -> (Vec<[f64; OUT]>, Vec<f64>) {
-        let dense = |dense: &Dense, x: &[f64]| -> Vec<f64> {
-            let rows = dense.weights.chunks(dense.inputs).enumerate();
-            rows.map(|(o, row)| {
-                let sum: f64 = row.iter().zip(x).map(|(w, x)| f64::from(*w) * x).sum();
-                sum + f64::from(dense.bias.get(o).copied().unwrap_or(0.0))
-            })
-            .collect()
-        };
-        let tanh = |x: Vec<f64>| x.into_iter().map(f64::tanh).collect::<Vec<_>>();
-        let n = observations.len();
-        let embeddings: Vec<Vec<f64>> = observations
-            .iter()
-            .map(|o| {
-                let z: Vec<f64> = (0..SIZE)
-                    .map(|i| (f64::from(o[i] - network.mean[i]) / f64::from(network.std[i])).clamp(-5.0, 5.0))
-                    .collect();
-                tanh(dense(&network.encoder, &z))
-            })
-            .collect();
-        let (mut actions, mut attention) = (vec![], vec![0.0; n * n]);
-        for i in 0..n {
-            let mut input = embeddings[i].clone();
-            let mut context = vec![0.0; VALUE];
-            if network.attention {
-                let q = dense(&network.query, &embeddings[i]);
-                let mut terms = vec![0.0; n];
-                for j in 0..n {
-                    let k = dense(&network.key, &embeddings[j]);
-                    if j == i || heard[i] >> j & 1 == 1 {
-                        terms[j] = (q.iter().zip(&k).map(|(q, k)| q * k).sum::<f64>() / 4.0).exp();
-                    }
-                }
-                let total: f64 = terms.iter().sum();
-                for j in 0..n {
-                    attention[i * n + j] = terms[j] / total;
-                    let v = dense(&network.value, &embeddings[j]);
-                    context.iter_mut().zip(v).for_each(|(c, v)| *c += terms[j] / total * v);
-                }
-            } else {
-                attention[i * n + i] = 1.0;
-            }
-            input.extend(context);
-            let a = dense(&network.output, &tanh(dense(&network.hidden, &input)));
-            actions.push([a[0].clamp(-1.0, 1.0), a[1].clamp(-1.0, 1.0)]);
-        }
-        (actions, attention)
-    }
-
-    #[test]
-    fn it_agrees_with_the_equations_for_any_number_of_modules() {
-        let mut worst = 0.0f64;
-        for (seed, n) in [1, 2, 4, 5, 8, 9, 11, 13, 16, 64].into_iter().enumerate() {
-            for attention in [true, false] {
-                let network = random_network(seed as u64, attention);
-                network.check().unwrap();
-                let o = observations(seed as u64, n);
-                let heard: Vec<u64> = (0..n as u64).map(|i| i.wrapping_mul(0x9e37_79b9_7f4a_7c15)).collect();
-                let (mut actions, mut weights) = (vec![[0.0; 2]; n], vec![0.0; n * n]);
-                network.act(&o, &heard, &mut actions, Some(&mut weights));
-                let (expected, expected_weights) = reference(&network, &o, &heard);
-                for (a, e) in actions.as_flattened().iter().zip(expected.as_flattened()) {
-                    worst = worst.max((f64::from(*a) - e).abs());
-                }
-                for (a, e) in weights.iter().zip(&expected_weights) {
-                    worst = worst.max((f64::from(*a) - e).abs());
-                }
-            }
-        }
-        println!("largest difference from the equations: {worst:.1e}");
-        assert!(worst < 2e-5, "{worst}");
-    }
-
-    #[test]
-    fn what_a_module_computes_alone_does_not_depend_on_the_others() {
-        let network = random_network(3, true);
-        let o = observations(3, 13);
-        let together = network.encode(&o);
-        for (i, encoded) in together.iter().enumerate() {
-            assert_eq!(network.encode(&o[i..=i])[0], *encoded);
-        }
-        let (mut alone, mut masked) = ([[0.0; 2]; 1], vec![[0.0; 2]; 13]);
-        network.act(&o[..1], &[0], &mut alone, None);
-        network.act(&o, &[0; 13], &mut masked, None);
-        assert_eq!(alone[0], masked[0]);
-    }
 
     #[test]
     fn broken_networks_are_refused_in_one_sentence() {

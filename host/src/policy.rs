@@ -5,7 +5,6 @@ use composer_shared::robot::MAX_MODULES;
 
 use crate::environment::View;
 use crate::methods::mix;
-use crate::network::Network;
 
 /// Decides what every module does in one control step.
 pub trait Policy: Sync {
@@ -24,20 +23,6 @@ impl<P: Policy + ?Sized> Policy for &P {
 fn still(view: &View, actions: &mut Vec<[f32; 2]>) {
     actions.clear();
     actions.resize(view.observations.len(), [0.0; 2]);
-}
-
-/// The network of COMPOSER as it was trained, in 32-bit floats.
-impl Policy for Network {
-    fn act(&self, view: &View, _noise: u64, actions: &mut Vec<[f32; 2]>, attention: Option<&mut Vec<f32>>) {
-        still(view, actions);
-        let modules = actions.len();
-        let attention = attention.map(|weights| {
-            weights.clear();
-            weights.resize(modules * modules, 0.0);
-            weights.as_mut_slice()
-        });
-        Network::act(self, &view.observations, &view.heard, actions, attention);
-    }
 }
 
 /// The frozen integer policy, as the modules run it.

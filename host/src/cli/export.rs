@@ -134,6 +134,7 @@ pub(super) fn measure(
 pub(super) fn freeze_run(folder: &Path, episodes: u64, threads: usize) -> Result<(RunConfig, Vec<u8>, Parity)> {
     let (config, policy) = load_run(folder)?;
     let network = policy.network().with_context(|| format!("{} cannot be frozen", folder.display()))?;
+    let decides = policy.policy();
     let env = Arc::new(config.evaluation());
     let draw = |seed, modules| config.faults.draw(seed, modules);
     let trial = Trial {
@@ -143,10 +144,10 @@ pub(super) fn freeze_run(folder: &Path, episodes: u64, threads: usize) -> Result
         faults: if config.faults.probability > 0.0 { &draw } else { &healthy },
         threads,
     };
-    let image = freeze(network, &config.meta(), &trial.observations(network))?;
-    let policy = Policy::parse(&image).map_err(|e| anyhow::anyhow!("the frozen image is refused: {e}"))?;
-    let held_out = Trial { seed: HELD_OUT_SEED, ..trial }.observations(network);
-    let parity = parity(network, &policy, &held_out);
+    let image = freeze(network, &config.meta(), &trial.observations(&*decides))?;
+    let frozen = Policy::parse(&image).map_err(|e| anyhow::anyhow!("the frozen image is refused: {e}"))?;
+    let held_out = Trial { seed: HELD_OUT_SEED, ..trial }.observations(&*decides);
+    let parity = parity(network, &frozen, &held_out);
     Ok((config, image, parity))
 }
 

@@ -155,7 +155,7 @@ impl PolicySource {
     pub fn policy(&self) -> Result<Box<dyn policy::Policy + '_>> {
         Ok(match self {
             PolicySource::Image(frozen) => Box::new(Policy::parse(&frozen.image).map_err(|e| anyhow::anyhow!("{e}"))?),
-            PolicySource::Run(run) => Box::new(&run.0),
+            PolicySource::Run(run) => run.0.policy(),
             PolicySource::Still => Box::new(policy::Still),
             PolicySource::Random => Box::new(policy::Random),
         })

@@ -25,7 +25,8 @@ pub struct Arguments {
     /// goal-reaching]
     #[arg(value_parser = task_by_name)]
     task: Option<Task>,
-    /// composer (self-attention and imagination policy), composer-no-imagination, composer-no-attention or mappo (neither)
+    /// composer (self-attention and imagination policy), its ablations composer-no-imagination, composer-no-attention and
+    /// composer-neither, or a baseline: ppo, mappo, mat, mat_dec or smp
     /// [default: the settings file's, else composer]
     #[arg(long)]
     method: Option<Method>,
@@ -122,10 +123,11 @@ pub fn train_in(config: &RunConfig, out: &Path, resuming: bool, name: Option<&st
             faults: &healthy,
             threads: config.train.threads(),
         };
-        let report = trial.evaluate(policy, "none", &|| {});
+        let runs = policy.policy();
+        let report = trial.evaluate(&*runs, "none", &|| {});
         let mut scalars = scalars(&report, "evaluation");
         if config.faults.probability > 0.0 {
-            let report = Trial { faults: &faulty, ..trial }.evaluate(policy, "as trained", &|| {});
+            let report = Trial { faults: &faulty, ..trial }.evaluate(&*runs, "as trained", &|| {});
             scalars.extend(self::scalars(&report, "evaluation_faults"));
         }
         // A run that is killed keeps the policy of its last evaluation; a failure to write shows at the checkpoint.

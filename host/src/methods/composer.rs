@@ -18,6 +18,7 @@
 pub mod actor;
 pub mod autodiff;
 pub mod critic;
+pub mod float;
 pub mod fused;
 #[cfg(test)]
 mod tests;
@@ -30,7 +31,7 @@ use self::actor::{Actor, ActorLayout, ActorScratch, log_probability};
 use self::critic::{Critic, CriticLayout, CriticScratch};
 use super::config::TrainConfig;
 use super::imagination::{DISPLACEMENT, Imagination};
-use super::normalise::{Forgetting, ValueNorm};
+use super::normalise::{CLIP, Forgetting, ValueNorm};
 use super::on_policy::collect::ACTIONS;
 use super::on_policy::update::Standardise;
 use super::on_policy::{
@@ -197,7 +198,7 @@ impl ActorCritic for Networks {
     }
 
     fn policy(&self, mean: [f32; SIZE], std: [f32; SIZE]) -> TrainedPolicy {
-        TrainedPolicy::Composer(self.actor.layout().network(self.actor.parameters(), mean, std))
+        TrainedPolicy::Composer(Box::new(self.actor.layout().network(self.actor.parameters(), mean, std)))
     }
 }
 
@@ -248,6 +249,8 @@ impl TrainConfig {
             kl_target: self.kl_target as f32,
             sigma_min: self.sigma_min as f32,
             standardise: Standardise::Rollout(1e-8),
+            observation_clip: Some(CLIP),
+            reward_clip: None,
         }
     }
 }

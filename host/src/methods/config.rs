@@ -4,9 +4,11 @@ use anyhow::{Result, bail};
 use serde::{Deserialize, Serialize};
 
 use super::Method;
+use super::baselines::{MappoConfig, MatConfig, MatDecConfig, PpoConfig};
 use super::composer::Differentiation;
 use super::imagination::ImaginationConfig;
 use super::on_policy::update::RATE_LIMITS;
+use super::smp::SmpConfig;
 
 /// Settings of the learner. Every field has a default, so that a TOML file needs to name only what it changes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -67,6 +69,16 @@ pub struct TrainConfig {
     pub threads: usize,
     /// The imagination policy, for the methods that have one.
     pub imagination: ImaginationConfig,
+    /// `ppo`, whose settings count there instead of those above; what is not among them is shared by all methods.
+    pub ppo: PpoConfig,
+    /// `mappo`, likewise.
+    pub mappo: MappoConfig,
+    /// `mat`, likewise.
+    pub mat: MatConfig,
+    /// `mat_dec`, likewise.
+    pub mat_dec: MatDecConfig,
+    /// `smp`, likewise.
+    pub smp: SmpConfig,
 }
 
 impl Default for TrainConfig {
@@ -99,6 +111,11 @@ impl Default for TrainConfig {
             checkpoint_seconds: 60.0,
             threads: 0,
             imagination: ImaginationConfig::default(),
+            ppo: PpoConfig::default(),
+            mappo: MappoConfig::default(),
+            mat: MatConfig::default(),
+            mat_dec: MatDecConfig::default(),
+            smp: SmpConfig::default(),
         }
     }
 }
@@ -169,7 +186,12 @@ impl TrainConfig {
         if self.total_steps == 0 {
             bail!("total_steps is 0; it must be at least 1");
         }
-        self.imagination.validate()
+        self.imagination.validate()?;
+        self.ppo.validate()?;
+        self.mappo.validate()?;
+        self.mat.validate()?;
+        self.mat_dec.validate()?;
+        self.smp.validate()
     }
 }
 

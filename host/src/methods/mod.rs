@@ -1,18 +1,26 @@
 //! The learning methods, one file each, and what they share.
 //!
 //! A method is an [`Algorithm`]: it iterates, hands over its policy, saves and loads. [`on_policy`] is one for every method that brings its
-//! networks as an [`on_policy::ActorCritic`]. What they share further: flat parameters with an optimiser ([`parameters`]), normalisers
+//! networks as an [`on_policy::ActorCritic`], [`off_policy`] for those with a replay buffer. What they share further: flat parameters with an optimiser ([`parameters`]), normalisers
 //! ([`normalise`]), random streams ([`random`]) and threads ([`workers`]).
 
+pub mod baselines;
 pub mod composer;
 pub mod config;
 pub mod imagination;
 pub(crate) mod kernels;
+pub mod mappo;
+pub mod mat;
+pub mod mat_dec;
 pub mod normalise;
+pub mod off_policy;
 pub mod on_policy;
 pub mod parameters;
+pub mod ppo;
 pub mod random;
 pub(crate) mod simd;
+pub mod smp;
+pub mod tensors;
 pub mod workers;
 
 use std::time::Duration;
@@ -20,10 +28,12 @@ use std::time::Duration;
 use anyhow::{Result, bail};
 use serde::{Deserialize, Serialize};
 
+pub use self::baselines::SavedWeights;
 pub use self::composer::Differentiation;
+use self::composer::float::FloatPolicy;
 pub use self::config::TrainConfig;
 pub(crate) use self::random::mix;
-use crate::environment::{Environment, Outcome, View};
+use crate::environment::{Environment, Outcome};
 use crate::network::Network;
 use crate::policy::Policy;
 
@@ -37,14 +47,38 @@ pub enum Method {
     ComposerNoImagination,
     /// COMPOSER without attention: modules do not talk.
     ComposerNoAttention,
-    /// MAPPO: the same actor with neither. PPO with one actor shared by all modules and a central critic.
+    /// COMPOSER with neither: its actor, alone with what its own module observes.
+    ComposerNeither,
+    /// PPO, central and zero-padded ([`ppo`]).
+    Ppo,
+    /// MAPPO ([`mappo`]).
     Mappo,
+    /// MAT ([`mat`]).
+    Mat,
+    /// MAT_dec ([`mat_dec`]).
+    #[serde(rename = "mat_dec")]
+    MatDec,
+    /// SMP ([`smp`]).
+    Smp,
 }
 
 impl Method {
     /// Every method, in the order of the documentation.
-    pub const ALL: [Method; 4] =
-        [Method::Composer, Method::ComposerNoImagination, Method::ComposerNoAttention, Method::Mappo];
+    pub const ALL: [Method; 9] = [
+        Method::Composer,
+        Method::ComposerNoImagination,
+        Method::ComposerNoAttention,
+        Method::ComposerNeither,
+        Method::Ppo,
+        Method::Mappo,
+        Method::Mat,
+        Method::MatDec,
+        Method::Smp,
+    ];
+
+    /// COMPOSER and its ablations.
+    pub const COMPOSERS: [Method; 4] =
+        [Method::Composer, Method::ComposerNoImagination, Method::ComposerNoAttention, Method::ComposerNeither];
 
     /// Name on the command line and in files.
     pub fn name(self) -> &'static str {
@@ -52,13 +86,36 @@ impl Method {
             Method::Composer => "composer",
             Method::ComposerNoImagination => "composer-no-imagination",
             Method::ComposerNoAttention => "composer-no-attention",
+            Method::ComposerNeither => "composer-neither",
+            Method::Ppo => "ppo",
             Method::Mappo => "mappo",
+            Method::Mat => "mat",
+            Method::MatDec => "mat_dec",
+            Method::Smp => "smp",
         }
     }
 
     /// The method of that name.
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|method| method.name() == name)
+    }
+
+    /// Why a policy of this method cannot be frozen for the modules, in a sentence.
+    fn why_not_frozen(self) -> &'static str {
+        match self {
+            Method::Ppo => {
+                "ppo decides for all modules in one place, so there is nothing that a module could run alone"
+            }
+            Method::Mat => {
+                "mat lets the modules decide one after the other, which no control step of the bus has time for"
+            }
+            Method::Mappo => "mappo normalises every layer, which the integer image of a module cannot",
+            Method::MatDec => "mat_dec normalises every layer, which the integer image of a module cannot",
+            Method::Smp => {
+                "smp passes messages from tail to head and back, which no control step of the bus has time for"
+            }
+            _ => "its network is none of COMPOSER's",
+        }
     }
 
     /// Whether the actor attends to the latents of other modules.
@@ -129,9 +186,14 @@ pub trait Algorithm: Send {
 pub fn create(config: &TrainConfig, make: MakeEnvironment) -> Result<Box<dyn Algorithm>> {
     config.validate()?;
     Ok(match config.method {
-        Method::Composer | Method::ComposerNoImagination | Method::ComposerNoAttention | Method::Mappo => {
+        Method::Composer | Method::ComposerNoImagination | Method::ComposerNoAttention | Method::ComposerNeither => {
             Box::new(composer::new(config, make)?)
         }
+        Method::Ppo => baselines::ppo(config, make)?,
+        Method::Mappo => baselines::mappo(config, make)?,
+        Method::Mat => baselines::mat(config, make)?,
+        Method::MatDec => baselines::mat_dec(config, make)?,
+        Method::Smp => Box::new(smp::new(config, make)?),
     })
 }
 
@@ -140,7 +202,9 @@ pub fn create(config: &TrainConfig, make: MakeEnvironment) -> Result<Box<dyn Alg
 #[serde(untagged)]
 pub enum TrainedPolicy {
     /// The network of COMPOSER or one of its ablations, which can be frozen.
-    Composer(Network),
+    Composer(Box<Network>),
+    /// That of a baseline, which cannot.
+    Weights(SavedWeights),
 }
 
 impl TrainedPolicy {
@@ -152,6 +216,7 @@ impl TrainedPolicy {
     pub fn network(&self) -> Result<&Network> {
         match self {
             TrainedPolicy::Composer(network) => Ok(network),
+            TrainedPolicy::Weights(saved) => bail!("{}", saved.method.why_not_frozen()),
         }
     }
 
@@ -159,14 +224,15 @@ impl TrainedPolicy {
     pub fn check(&self) -> Result<()> {
         match self {
             TrainedPolicy::Composer(network) => Ok(network.check()?),
+            TrainedPolicy::Weights(saved) => saved.check(),
         }
     }
-}
 
-impl Policy for TrainedPolicy {
-    fn act(&self, view: &View, noise: u64, actions: &mut Vec<[f32; 2]>, attention: Option<&mut Vec<f32>>) {
+    /// What decides the torques.
+    pub fn policy(&self) -> Box<dyn Policy + '_> {
         match self {
-            TrainedPolicy::Composer(network) => Policy::act(network, view, noise, actions, attention),
+            TrainedPolicy::Composer(network) => Box::new(FloatPolicy::new(network)),
+            TrainedPolicy::Weights(saved) => saved.policy(),
         }
     }
 }
@@ -235,6 +301,8 @@ pub struct State {
     pub statistics: Vec<f64>,
     /// One entry per environment.
     pub episodes: Vec<EpisodeState>,
+    /// The replay buffer of an off-policy method, in numbers of its own; else empty.
+    pub replay: Vec<f32>,
 }
 
 /// A running episode of one environment: replaying its actions after the reset leads back to where it was.
@@ -291,6 +359,6 @@ mod tests {
             assert_eq!(method.name().parse::<Method>(), Ok(method));
             assert_eq!(serde_json::to_string(&method).unwrap(), format!("\"{}\"", method.name()));
         }
-        assert!("composers".parse::<Method>().unwrap_err().contains("composer-no-attention, mappo"));
+        assert!("composers".parse::<Method>().unwrap_err().contains("composer-neither, ppo, mappo, mat, mat_dec, smp"));
     }
 }

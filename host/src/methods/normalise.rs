@@ -84,17 +84,35 @@ pub const CLIP: f32 = 5.0;
 pub struct Frozen<const N: usize> {
     mean: [f32; N],
     scale: [f32; N],
+    clip: f32,
+}
+
+impl Frozen<1> {
+    /// A number divided by the standard deviation, its mean left in, and clipped.
+    pub fn scaled(&self, x: f32) -> f32 {
+        (x * self.scale[0]).clamp(-self.clip, self.clip)
+    }
 }
 
 impl<const N: usize> Frozen<N> {
     /// The statistics as they are now.
     pub fn new(running: &Running) -> Self {
-        Self { mean: running.mean(), scale: running.std::<N>().map(f32::recip) }
+        Self::with_clip(running, CLIP)
+    }
+
+    /// The same with another limit.
+    pub fn with_clip(running: &Running, clip: f32) -> Self {
+        Self { mean: running.mean(), scale: running.std::<N>().map(f32::recip), clip }
+    }
+
+    /// Leaves numbers as they are.
+    pub fn off() -> Self {
+        Self { mean: [0.0; N], scale: [1.0; N], clip: f32::MAX }
     }
 
     /// Appends the numbers, normalised and clipped.
     pub fn apply(&self, x: &[f32; N], out: &mut Vec<f32>) {
-        out.extend((0..N).map(|i| ((x[i] - self.mean[i]) * self.scale[i]).clamp(-CLIP, CLIP)));
+        out.extend((0..N).map(|i| ((x[i] - self.mean[i]) * self.scale[i]).clamp(-self.clip, self.clip)));
     }
 }
 

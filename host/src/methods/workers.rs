@@ -52,6 +52,14 @@ impl Workers {
         });
     }
 
+    /// Runs `job(index)` for every index below `count`; the results come in order.
+    pub fn map<T: Send>(&self, count: usize, job: impl Fn(usize) -> T + Sync) -> Vec<T> {
+        let mut results: Vec<Option<T>> = (0..count).map(|_| None).collect();
+        let mut scratch = vec![(); self.threads()];
+        self.for_each(results.iter_mut().enumerate(), &mut scratch, |(index, result), ()| *result = Some(job(index)));
+        results.into_iter().flatten().collect()
+    }
+
     /// Runs both, side by side if two threads are free.
     pub fn join<A: Send, B: Send>(&self, a: impl FnOnce() -> A + Send, b: impl FnOnce() -> B + Send) -> (A, B) {
         self.pool.join(a, b)

@@ -87,6 +87,11 @@ impl Checkpoint {
             number(&mut out, episode.actions.len() as u64);
             episode.actions.as_flattened().iter().for_each(|a| out.extend_from_slice(&a.to_le_bytes()));
         }
+        // Nothing where there is no replay buffer.
+        if !self.state.replay.is_empty() {
+            number(&mut out, self.state.replay.len() as u64);
+            self.state.replay.iter().for_each(|x| out.extend_from_slice(&x.to_le_bytes()));
+        }
         out.extend_from_slice(&CRC.checksum(&out).to_le_bytes());
         out
     }
@@ -115,6 +120,9 @@ impl Checkpoint {
             let actions =
                 reader.floats(ACTIONS)?.chunks_exact(ACTIONS).map(|pair| std::array::from_fn(|i| pair[i])).collect();
             state.episodes.push(EpisodeState { number, actions });
+        }
+        if !reader.0.is_empty() {
+            state.replay = reader.floats(1)?;
         }
         reader.0.is_empty().then_some(Self { config, fingerprint, state })
     }
@@ -214,6 +222,7 @@ mod tests {
                     EpisodeState { number: 5, actions: vec![[0.1, -7.5], [1e-30, 2.0]] },
                     EpisodeState { number: 0, actions: vec![] },
                 ],
+                replay: vec![1.5, f32::MAX],
             },
         }
     }

@@ -269,8 +269,8 @@ mod tests {
     use super::*;
     use crate::environment::{Environment, Told, Trivial, View};
     use crate::methods::Method;
+    use crate::methods::baselines::{MappoConfig, MatConfig};
     use crate::methods::imagination::ImaginationConfig;
-    use crate::policy::Policy;
 
     fn small(method: Method) -> TrainConfig {
         TrainConfig {
@@ -292,7 +292,7 @@ mod tests {
 
     #[test]
     fn six_iterations_are_three_and_a_resumption_and_three() {
-        for method in Method::ALL {
+        for method in Method::COMPOSERS {
             // With a learning rate that falls and with one that is adapted.
             let kl_target = if method.imagination() { 0.01 } else { 0.0 };
             let config = TrainConfig { total_steps: 6 * 96, kl_target, ..small(method) };
@@ -318,11 +318,89 @@ mod tests {
         }
     }
 
+    /// Settings with which every baseline is quick.
+    fn small_baseline(method: Method) -> TrainConfig {
+        let mut config = TrainConfig { method, total_steps: 6 * 96, ..TrainConfig::default() };
+        config.ppo.environments = 4;
+        config.ppo.rollout_steps = 24;
+        config.ppo.minibatches = 2;
+        config.ppo.epochs = 2;
+        config.mappo = MappoConfig { environments: 4, rollout_steps: 24, epochs: 2, ..MappoConfig::default() };
+        config.mat =
+            MatConfig { environments: 4, rollout_steps: 24, minibatches: 2, epochs: 2, ..MatConfig::default() };
+        config.mat_dec.environments = 4;
+        config.mat_dec.rollout_steps = 24;
+        config.mat_dec.minibatches = 2;
+        config.mat_dec.epochs = 2;
+        config.smp.rollout_steps = 24;
+        config.smp.random_steps = 100;
+        config.smp.updates_per_step = 0.0313;
+        config.smp.widths = [24, 16];
+        config
+    }
+
+    const BASELINES: [Method; 5] = [Method::Ppo, Method::Mappo, Method::Mat, Method::MatDec, Method::Smp];
+
+    #[test]
+    fn baselines_go_on_bit_for_bit_too_whatever_the_threads() {
+        let teams: MakeEnvironment = &|index| {
+            let team = Trivial::new(3, Told::Head);
+            Ok(Box::new(if index == 2 { team.with_dead(1) } else { team }))
+        };
+        for method in BASELINES {
+            let config = small_baseline(method);
+            let mut straight = Trainer::new(&TrainConfig { threads: 2, ..config.clone() }, teams, "trivial").unwrap();
+            (0..4).for_each(|_| drop(straight.iterate().unwrap()));
+            let mut first = Trainer::new(&TrainConfig { threads: 1, ..config.clone() }, teams, "trivial").unwrap();
+            (0..2).for_each(|_| drop(first.iterate().unwrap()));
+            let folder = tempfile::tempdir().unwrap();
+            first.checkpoint().unwrap().write(folder.path()).unwrap();
+            let checkpoint = Checkpoint::read(folder.path()).unwrap();
+            let mut second = Trainer::resume(&checkpoint, &config, teams, "trivial").unwrap();
+            (0..2).for_each(|_| drop(second.iterate().unwrap()));
+            assert_eq!(second.checkpoint().unwrap().state, straight.checkpoint().unwrap().state, "{method}");
+            // The policy survives its file and acts, for longer snakes too.
+            let policy = second.policy();
+            let text = serde_json::to_string(&policy).unwrap();
+            let read: TrainedPolicy = serde_json::from_str(&text).unwrap();
+            assert_eq!(read, policy);
+            read.check().unwrap();
+            for modules in [3, 5, 12] {
+                let mut view = View::default();
+                let mut team = Trivial::new(modules, Told::All);
+                team.reset(1);
+                team.view(&mut view);
+                let mut actions = Vec::new();
+                read.policy().act(&view, 0, &mut actions, None);
+                assert_eq!(actions.len(), modules);
+                assert!(actions.as_flattened().iter().all(|a| a.is_finite()), "{method}");
+            }
+            // And says why it cannot be frozen.
+            let error = policy.network().unwrap_err().to_string();
+            assert!(error.starts_with(method.name()) && !error.contains('\n'), "{error}");
+        }
+    }
+
+    #[test]
+    fn baselines_that_need_one_length_refuse_several() {
+        for method in [Method::Mappo, Method::Smp] {
+            let error = Trainer::new(&small_baseline(method), &teams, "trivial").err().unwrap().to_string();
+            assert!(error.contains("snakes of one length") && error.contains("lengths = []"), "{error}");
+        }
+        let long: MakeEnvironment = &|_| Ok(Box::new(Trivial::new(12, Told::All)));
+        let error = Trainer::new(&small_baseline(Method::Ppo), long, "trivial").err().unwrap().to_string();
+        assert!(error.contains("ppo is made for at most 11 modules"), "{error}");
+        let mut config = small_baseline(Method::Mat);
+        config.mat.epochs = 0;
+        let error = Trainer::new(&config, &teams, "trivial").err().unwrap().to_string();
+        assert_eq!(error, "mat.epochs is 0; it must be from 1 to 1000");
+    }
+
     #[test]
     fn a_whole_run_can_be_stopped_and_resumed_through_its_folder() {
         let make: MakeEnvironment = &teams;
         let quiet = |_: &TrainedPolicy, steps: u64| vec![("eval/steps".to_string(), steps as f64)];
-        let config = TrainConfig { total_steps: 4 * 96, evaluate_every: 200, ..small(Method::Mappo) };
+        let config = TrainConfig { total_steps: 4 * 96, evaluate_every: 200, ..small(Method::ComposerNeither) };
         let (a, b) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
         let whole = train(&config, make, "trivial", a.path(), false, None, &mut { quiet }).unwrap();
         assert_eq!((whole.steps, whole.iterations, whole.interrupted), (384, 4, false));
@@ -343,14 +421,14 @@ mod tests {
 
     #[test]
     fn the_settings_are_in_the_checkpoint() {
-        let config = small(Method::Mappo);
+        let config = small(Method::ComposerNeither);
         let checkpoint = Trainer::new(&config, &teams, "trivial").unwrap().checkpoint().unwrap();
         assert_eq!(config_of(&checkpoint).unwrap(), config);
     }
 
     #[test]
     fn what_cannot_be_resumed_is_refused_with_a_reason() {
-        let config = small(Method::Mappo);
+        let config = small(Method::ComposerNeither);
         let checkpoint = Trainer::new(&config, &teams, "trivial").unwrap().checkpoint().unwrap();
         let refused = |config: &TrainConfig, fingerprint: &str| {
             Trainer::resume(&checkpoint, config, &teams, fingerprint).err().unwrap().to_string()
@@ -365,7 +443,7 @@ mod tests {
         let mut without = checkpoint.clone();
         without.state.learners.clear();
         let error = Trainer::resume(&without, &config, &teams, "trivial").err().unwrap().to_string();
-        assert!(error.contains("0 policies where the method mappo has 1"), "{error}");
+        assert!(error.contains("0 policies where the method composer-neither has 1"), "{error}");
         let longer = TrainConfig { total_steps: 2_000_000, threads: 3, ..config.clone() };
         assert!(Trainer::resume(&checkpoint, &longer, &teams, "trivial").is_ok());
 
@@ -397,12 +475,12 @@ mod tests {
     fn reward(policy: &TrainedPolicy, modules: usize, told: Told) -> f32 {
         let mut team = Trivial::new(modules, told);
         let mut view = View::default();
-        let mut actions = Vec::new();
+        let (decides, mut actions) = (policy.policy(), Vec::new());
         let total: f32 = (0..200)
             .map(|seed| {
                 team.reset(seed);
                 team.view(&mut view);
-                policy.act(&view, 0, &mut actions, None);
+                decides.act(&view, 0, &mut actions, None);
                 team.step(&actions).reward
             })
             .sum();
@@ -433,7 +511,7 @@ mod tests {
 
     #[test]
     fn all_methods_solve_the_trivial_task() {
-        for method in Method::ALL {
+        for method in Method::COMPOSERS {
             let policy = learn(method, Told::All);
             let reward = reward(&policy, 4, Told::All);
             assert!(reward > 0.95, "{method}: {reward}");
@@ -446,7 +524,7 @@ mod tests {
         let attention = reward_of(Method::ComposerNoImagination);
         assert!(attention > 0.95, "{attention}");
         // Three of four modules can do no better than zero: 1 - 3/4 * 1/3.
-        let alone = reward_of(Method::Mappo);
+        let alone = reward_of(Method::ComposerNeither);
         assert!(alone < 0.8, "{alone}");
     }
 }

@@ -10,7 +10,7 @@ mod rows;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use anyhow::{Context, Result, bail};
 use composer_shared::policy::Task;
@@ -18,7 +18,7 @@ use serde_json::{Value, json};
 
 use super::policy_file::{CONFIG_FILE, load_config, load_run};
 use super::train::train_in;
-use crate::eval::{PUBLISHED_EPISODES, PUBLISHED_SEED, Trial, healthy, parallel};
+use crate::eval::{PUBLISHED_EPISODES, PUBLISHED_SEED, Trial, healthy};
 use crate::files::{create_folder, write_whole};
 use crate::methods::Method;
 use crate::plot::{Axes, Panel, common_grid, mean_and_error, mean_and_se, panels};
@@ -42,7 +42,7 @@ pub struct Arguments {
 /// What can be published.
 #[derive(clap::Subcommand, Clone, Debug)]
 enum Which {
-    /// Goal Reaching: mappo against composer-no-imagination, goal known to all modules and to the head alone.
+    /// Goal Reaching: composer-neither against composer-no-imagination, goal known to all modules and to the head alone.
     Attention(Comparison),
     /// All five tasks: composer against itself without imagination and without attention (the paper's ablation), and where the
     /// modules of the complete method attend.
@@ -123,7 +123,7 @@ impl What {
 
     fn methods(self) -> Vec<Method> {
         match self {
-            What::Attention => vec![Method::Mappo, Method::ComposerNoImagination],
+            What::Attention => vec![Method::ComposerNeither, Method::ComposerNoImagination],
             What::Ablation => vec![Method::Composer, Method::ComposerNoImagination, Method::ComposerNoAttention],
         }
     }
@@ -212,7 +212,7 @@ fn compare(what: What, arguments: &Comparison) -> Result<()> {
             let Some(run) = runs.iter().find(complete) else { continue };
             let (config, policy) = load_run(&run.folder)?;
             let path = out.join(format!("attention-{task}.svg"));
-            attention_maps::write(&config, &policy, &path)?;
+            attention_maps::write(&config, &*policy.policy(), &path)?;
         }
     }
     let seeds = if arguments.so_far { "those".into() } else { arguments.seeds.to_string() };
@@ -226,6 +226,31 @@ fn finish_all(what: What, runs: &[Run], arguments: &Comparison) -> Result<bool> 
     side_by_side(&folders, arguments.jobs, |number, threads| finish(what, &runs[number], arguments.episodes, threads))
 }
 
+/// Runs `job(index)` for every index below `count` on `threads` threads of their own and returns the results in order. A job has workers of
+/// its own in turn; on a worker's thread it might be begun while another waits for those.
+fn side_by_side_threads<T: Send>(count: usize, threads: usize, job: impl Fn(usize) -> T + Sync) -> Vec<T> {
+    let next = AtomicUsize::new(0);
+    let mut results: Vec<(usize, T)> = std::thread::scope(|scope| {
+        let workers: Vec<_> = (0..threads.max(1))
+            .map(|_| {
+                scope.spawn(|| {
+                    let mut done = Vec::new();
+                    loop {
+                        let index = next.fetch_add(1, Ordering::Relaxed);
+                        if index >= count {
+                            return done;
+                        }
+                        done.push((index, job(index)));
+                    }
+                })
+            })
+            .collect();
+        workers.into_iter().flat_map(|w| w.join().expect("a worker thread does not panic")).collect()
+    });
+    results.sort_by_key(|r| r.0);
+    results.into_iter().map(|r| r.1).collect()
+}
+
 /// Works on all runs, `jobs` at a time (default: the cores), each on its share of the cores: `job` gets a run's number and its threads. False:
 /// interrupted; the runs that had not begun are left out.
 fn side_by_side(folders: &[&Path], jobs: Option<u64>, job: impl Fn(usize, usize) -> Result<()> + Sync) -> Result<bool> {
@@ -233,7 +258,7 @@ fn side_by_side(folders: &[&Path], jobs: Option<u64>, job: impl Fn(usize, usize)
     let threads = (super::cores() / jobs).max(1);
     let stop = Signals::new()?;
     let failed = AtomicBool::new(false);
-    let results = parallel(folders.len(), jobs, |number| {
+    let results = side_by_side_threads(folders.len(), jobs, |number| {
         if stop.raised() || failed.load(Ordering::Relaxed) {
             return Ok(());
         }
@@ -277,12 +302,13 @@ fn finish(what: What, run: &Run, episodes: u64, threads: usize) -> Result<()> {
     let (config, policy) = load_run(&run.folder)?;
     let env = Arc::new(config.evaluation());
     let trial = Trial { config: &env, episodes: episodes as usize, seed: PUBLISHED_SEED, faults: &healthy, threads };
+    let runs = policy.policy();
     let mut results = serde_json::Map::new();
     for (fault, _) in what.faults() {
         let plan: composer_sim_bridge::faults::FaultPlan =
             fault.parse().with_context(|| format!("the fault {fault}"))?;
         let draw = |seed, modules| plan.draw(seed, modules);
-        let report = Trial { faults: &draw, ..trial }.evaluate(&policy, fault, &|| {});
+        let report = Trial { faults: &draw, ..trial }.evaluate(&*runs, fault, &|| {});
         results.insert(fault.into(), serde_json::to_value(report)?);
     }
     write_whole(&result, serde_json::to_string_pretty(&results)?.as_bytes())

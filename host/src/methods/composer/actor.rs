@@ -8,6 +8,7 @@
 //! team alone, bit for bit: a batch of many teams and a rollout of one agree.
 
 use composer_shared::observation::SIZE;
+pub use composer_shared::policy::{EMBED, HIDDEN, KEY, VALUE};
 
 use crate::methods::kernels::{Start, bias_tanh_backward, dense, dense_weights, dot, head, head_backward, tanh};
 use crate::methods::on_policy::{Batch, Gradient, LossSettings};
@@ -16,14 +17,6 @@ use crate::methods::random::{Stream, stream};
 use crate::methods::simd::{Vector, vectorise};
 use crate::network::{Dense, Network};
 
-/// Size of a module's embedding.
-pub const EMBED: usize = 64;
-/// Size of a latent's key and of a query.
-pub const KEY: usize = 16;
-/// Size of a latent's value.
-pub const VALUE: usize = 32;
-/// Size of the hidden layer.
-pub const HIDDEN: usize = 64;
 /// Where things are in an actor's parameters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ActorLayout {
@@ -125,6 +118,27 @@ impl ActorLayout {
         p
     }
 
+    /// The parameters that a network of this layout has; the standard deviation of its actions, which it does not have, is 1.
+    pub fn parameters(&self, network: &Network) -> Vec<f32> {
+        let mut p = vec![0.0; self.len];
+        let mut put = |block: Block, from: &[f32]| p[block.range()].copy_from_slice(from);
+        put(self.encoder, &network.encoder.weights);
+        put(self.encoder_bias, &network.encoder.bias);
+        if !self.attention.is_empty() {
+            put(self.attention, &[&network.query.weights[..], &network.key.weights, &network.value.weights].concat());
+        }
+        put(self.hidden_bias, &network.hidden.bias);
+        put(self.output, &network.output.weights);
+        put(self.output_bias, &network.output.bias);
+        let context = self.hidden_context.columns;
+        for (row, weights) in network.hidden.weights.chunks_exact(EMBED + VALUE).enumerate() {
+            p[self.hidden.offset + row * EMBED..][..EMBED].copy_from_slice(&weights[..EMBED]);
+            p[self.hidden_context.offset + row * context..][..context]
+                .copy_from_slice(&weights[EMBED..EMBED + context]);
+        }
+        p
+    }
+
     /// The network that these parameters of a control policy are, with the statistics of its observations.
     pub fn network(&self, parameters: &[f32], mean: [f32; SIZE], std: [f32; SIZE]) -> Network {
         let dense =
@@ -155,7 +169,7 @@ impl ActorLayout {
 }
 
 /// Query, key and value of one module in a row.
-const LATENT: usize = 2 * KEY + VALUE;
+pub const LATENT: usize = 2 * KEY + VALUE;
 
 /// An actor's weights, ready for both ways.
 #[derive(Clone, Debug)]
@@ -175,9 +189,9 @@ pub struct ActorScratch {
     /// `[rows, EMBED]`
     embedding: Vec<f32>,
     /// `[rows, LATENT]`
-    latent: Vec<f32>,
+    pub(super) latent: Vec<f32>,
     /// Weights of attention: `[modules, modules]` for each team.
-    attention: Vec<f32>,
+    pub(super) attention: Vec<f32>,
     /// `[rows, VALUE]`
     context: Vec<f32>,
     /// `[rows, HIDDEN]`

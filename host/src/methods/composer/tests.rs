@@ -2,6 +2,7 @@
 
 use rand::RngExt;
 
+use super::float::FloatPolicy;
 use super::*;
 use crate::environment::{Drift, Environment, PRIVILEGED, Told, Trivial, View};
 use crate::methods::Method;
@@ -43,7 +44,8 @@ fn rollout(method: Method) -> Rollout {
         Box::new(Trivial::new(3, Told::All)),
         Box::new(Trivial::new(5, Told::Head).with_dead(2)),
     ];
-    let mut workers: Vec<_> = teams.into_iter().enumerate().map(|(i, team)| RolloutWorker::new(team, i, 5)).collect();
+    let mut workers: Vec<_> =
+        teams.into_iter().enumerate().map(|(i, team)| RolloutWorker::new(team, i, 5, 0.9)).collect();
     let mut buffer = RolloutBuffer::new(3);
     let (mut observations, mut privileged) = (Running::new(SIZE), Running::new(PRIVILEGED));
     let rules = Imagination { bound: 0.5, follow: 0.25 };
@@ -52,11 +54,18 @@ fn rollout(method: Method) -> Rollout {
         companion: Some((&imagination.networks, imagination.seed, &rules)),
         observations: Frozen::new(&observations),
         privileged: Frozen::new(&privileged),
+        rewards: None,
         run_seed: 5,
         iteration: 0,
         steps: 16,
     };
-    collect(&mut workers, &mut buffer, &iteration, &Workers::new(2).unwrap(), &mut observations, &mut privileged);
+    collect(
+        &mut workers,
+        &mut buffer,
+        &iteration,
+        &Workers::new(2).unwrap(),
+        [&mut observations, &mut privileged, &mut Running::new(1)],
+    );
     Rollout { control, imagination, buffer }
 }
 
@@ -68,6 +77,8 @@ const SETTINGS: OnPolicySettings = OnPolicySettings {
     learning_rate: 1e-3,
     learning_rate_end: 1.0,
     standardise: Standardise::Rollout(1e-8),
+    observation_clip: Some(CLIP),
+    reward_clip: None,
     minibatches: 2,
     epochs: 2,
     critic_epochs: 2,
@@ -146,7 +157,7 @@ fn ratio_is_one(name: &str, learner: &Learner, trajectories: &[Trajectory], deci
 
 #[test]
 fn ratio_is_one_on_the_first_minibatch_with_masks_and_padding() {
-    for method in Method::ALL {
+    for method in Method::COMPOSERS {
         let Rollout { control, imagination, buffer } = rollout(method);
         ratio_is_one(method.name(), &control, &buffer.trajectories, &buffer.control);
         ratio_is_one("imagination", &imagination, &buffer.trajectories, &buffer.companion);
@@ -257,7 +268,7 @@ fn clipped_loss(learner: &Learner, batch: &Batch) {
 #[test]
 fn the_gradient_of_the_clipped_loss_is_its_slope() {
     // With attention and without.
-    for method in [Method::Composer, Method::Mappo] {
+    for method in [Method::Composer, Method::ComposerNeither] {
         let Rollout {
             control,
             imagination,
@@ -271,7 +282,7 @@ fn the_gradient_of_the_clipped_loss_is_its_slope() {
 /// Some critic, and a batch.
 fn critic() -> (Vec<f32>, Batch) {
     let Rollout { control, buffer: RolloutBuffer { trajectories, control: mut decisions, .. }, .. } =
-        rollout(Method::Mappo);
+        rollout(Method::ComposerNeither);
     (control.critic, shaken(&trajectories, &mut decisions))
 }
 
@@ -307,7 +318,7 @@ fn same(name: &str, manual: &Gradient, automatic: &Gradient, blocks: &[Block]) {
 
 #[test]
 fn gradients_by_hand_are_those_of_automatic_differentiation() {
-    for method in Method::ALL {
+    for method in Method::COMPOSERS {
         let Rollout {
             control,
             imagination,
@@ -351,7 +362,7 @@ fn the_learning_rate_follows_the_divergence() {
         assert_eq!(adapted(1e-3, kl, 0.01), expected);
     }
     assert_eq!([adapted(1e-5, 1.0, 0.01), adapted(1e-2, 0.0, 0.01), adapted(1.0, 1.0, 0.0)], [1e-5, 1e-2, 1.0]);
-    let Rollout { mut control, mut buffer, .. } = rollout(Method::Mappo);
+    let Rollout { mut control, mut buffer, .. } = rollout(Method::ComposerNeither);
     let settings = OnPolicySettings { kl_target: 1.0, kl_stop: 10.0, ..SETTINGS };
     let mut workspace = Workspace::new(1).unwrap();
     update(&mut control, &buffer.trajectories, &mut buffer.control, &settings, 1e-3, 0, &mut workspace);
@@ -360,7 +371,7 @@ fn the_learning_rate_follows_the_divergence() {
 
 #[test]
 fn sigma_stays_above_its_least() {
-    let Rollout { mut control, mut buffer, .. } = rollout(Method::Mappo);
+    let Rollout { mut control, mut buffer, .. } = rollout(Method::ComposerNeither);
     let settings = OnPolicySettings { sigma_min: 0.6, ..SETTINGS };
     let mut workspace = Workspace::new(1).unwrap();
     update(&mut control, &buffer.trajectories, &mut buffer.control, &settings, 1e-3, 0, &mut workspace);
@@ -402,7 +413,7 @@ fn an_update_does_not_depend_on_the_threads() {
 
 #[test]
 fn the_actor_stops_at_the_kl_limit() {
-    let Rollout { control: mut learner, mut buffer, .. } = rollout(Method::Mappo);
+    let Rollout { control: mut learner, mut buffer, .. } = rollout(Method::ComposerNeither);
     let settings = OnPolicySettings { kl_stop: 1e-4, epochs: 10, ..SETTINGS };
     let mut workspace = Workspace::new(1).unwrap();
     let (trajectories, decisions) = (&buffer.trajectories, &mut buffer.control);
@@ -459,7 +470,7 @@ fn the_imagination_points_at_the_target_and_the_control_policy_follows() {
             let best = view.observations.iter().map(|o| o[0].hypot(o[1]).min(bound)).sum::<f32>() / 3.0;
             possible += best;
             let mut actions = [[0.0; 2]; 3];
-            network.act(&view.observations, &view.heard, &mut actions, None);
+            FloatPolicy::new(&network).act(&view.observations, &view.heard, &mut actions, None);
             let outcome = env.step(&actions);
             if outcome.truncated {
                 distance += outcome.distance / 100.0;
@@ -470,14 +481,14 @@ fn the_imagination_points_at_the_target_and_the_control_policy_follows() {
     assert!(earned > 0.9 * possible, "{earned} of {possible}");
     assert!(distance < 0.3, "{distance}");
     // Without imagination nobody tells them where to go.
-    let network = network_of(&trained(Method::Mappo, 10_000, drift));
+    let network = network_of(&trained(Method::ComposerNeither, 10_000, drift));
     let mut apart = 0.0;
     for seed in 0..100 {
         env.reset(seed);
         for _ in 0..Drift::STEPS {
             env.view(&mut view);
             let mut actions = [[0.0; 2]; 3];
-            network.act(&view.observations, &view.heard, &mut actions, None);
+            FloatPolicy::new(&network).act(&view.observations, &view.heard, &mut actions, None);
             let outcome = env.step(&actions);
             apart += if outcome.truncated { outcome.distance / 100.0 } else { 0.0 };
         }

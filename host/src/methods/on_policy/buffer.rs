@@ -1,6 +1,8 @@
 //! The rollout buffer: what every environment went through in one iteration, what each policy did in it, advantages over that, and batches
 //! gathered from it.
 
+use std::ops::Range;
+
 use composer_shared::observation::SIZE;
 
 use super::Valued;
@@ -194,6 +196,29 @@ impl Batch {
     /// Modules of all samples together.
     pub fn rows(&self) -> usize {
         self.heard.len()
+    }
+
+    /// Some of its rows, which are those of some of its samples; `of_rows`: advantages and values are one a row.
+    pub fn part(&self, rows: Range<usize>, samples: Range<usize>, of_rows: bool) -> Batch {
+        let all = self.rows().max(1);
+        let of = |numbers: &[f32]| {
+            let width = numbers.len() / all;
+            numbers[rows.start * width..rows.end * width].to_vec()
+        };
+        let valued = if of_rows { rows.clone() } else { samples.clone() };
+        let valued = |numbers: &[f32]| numbers[valued.clone()].to_vec();
+        Batch {
+            modules: self.modules[samples].to_vec(),
+            observations: of(&self.observations),
+            privileged: of(&self.privileged),
+            heard: self.heard[rows.clone()].to_vec(),
+            weights: of(&self.weights),
+            actions: of(&self.actions),
+            log_probabilities: of(&self.log_probabilities),
+            advantages: valued(&self.advantages),
+            targets: valued(&self.targets),
+            values: valued(&self.values),
+        }
     }
 
     /// Empties the batch and keeps its memory.

@@ -20,22 +20,26 @@ pub const ACTIONS: usize = 2;
 
 /// An environment, where it is in its sequence of episodes, and how it got there.
 pub struct RolloutWorker {
-    environment: Box<dyn Environment>,
-    index: usize,
+    pub(crate) environment: Box<dyn Environment>,
+    pub(crate) index: usize,
     modules: usize,
     /// Number of the running episode.
     pub episode: u64,
     /// Actions since its reset, all modules of a step together.
     pub actions: Vec<[f32; ACTIONS]>,
-    view: View,
+    pub(crate) view: View,
     observations: Running,
     privileged: Running,
+    gamma: f32,
+    /// Running discounted sum of the rewards of the episode.
+    discounted: f32,
+    returns: Running,
 }
 
 impl RolloutWorker {
     /// Starts the first episode of the environment `index` of a run.
-    pub fn new(environment: Box<dyn Environment>, index: usize, run_seed: u64) -> Self {
-        Self::restore(environment, index, run_seed, 0, Vec::new())
+    pub fn new(environment: Box<dyn Environment>, index: usize, run_seed: u64, gamma: f32) -> Self {
+        Self::restore(environment, index, run_seed, gamma, 0, Vec::new())
     }
 
     /// Brings an environment back to where it was: starts its episode again and replays the actions.
@@ -43,13 +47,15 @@ impl RolloutWorker {
         mut environment: Box<dyn Environment>,
         index: usize,
         run_seed: u64,
+        gamma: f32,
         episode: u64,
         actions: Vec<[f32; ACTIONS]>,
     ) -> Self {
         environment.reset(episode_seed(run_seed, index, episode));
         let modules = environment.modules();
+        let mut discounted = 0.0;
         for step in actions.chunks_exact(modules.max(1)) {
-            environment.step(step);
+            discounted = gamma * discounted + environment.step(step).reward;
         }
         let mut view = View::default();
         environment.view(&mut view);
@@ -62,6 +68,9 @@ impl RolloutWorker {
             view,
             observations: Running::new(SIZE),
             privileged: Running::new(PRIVILEGED),
+            gamma,
+            discounted,
+            returns: Running::new(1),
         }
     }
 
@@ -104,6 +113,8 @@ pub struct Iteration<'a, C> {
     pub observations: Frozen<SIZE>,
     /// Statistics of the privileged numbers.
     pub privileged: Frozen<PRIVILEGED>,
+    /// Statistics of the running discounted sums of rewards, if rewards are divided by their standard deviation.
+    pub rewards: Option<Frozen<1>>,
     /// Seed of the run.
     pub run_seed: u64,
     /// Number of the iteration.
@@ -121,14 +132,14 @@ pub struct Split {
     pub inference: Duration,
 }
 
-/// Runs an iteration: fills `buffer` (as many environments as workers) and takes what was seen into `observations` and `privileged`.
+/// Runs an iteration: fills `buffer` (as many environments as workers) and takes what was seen into the statistics of
+/// observations, privileged numbers and running discounted sums of rewards.
 pub fn collect<C: ActorCritic>(
     environments: &mut [RolloutWorker],
     buffer: &mut RolloutBuffer,
     iteration: &Iteration<C>,
     workers: &Workers,
-    observations: &mut Running,
-    privileged: &mut Running,
+    [observations, privileged, returns]: [&mut Running; 3],
 ) -> Split {
     let mut scratch: Vec<(C::Scratch, Split)> = (0..workers.threads()).map(|_| Default::default()).collect();
     let RolloutBuffer { trajectories, control, companion } = buffer;
@@ -144,6 +155,7 @@ pub fn collect<C: ActorCritic>(
     for environment in environments {
         observations.merge(&std::mem::replace(&mut environment.observations, Running::new(SIZE)));
         privileged.merge(&std::mem::replace(&mut environment.privileged, Running::new(PRIVILEGED)));
+        returns.merge(&std::mem::replace(&mut environment.returns, Running::new(1)));
     }
     let mut total = Split::default();
     for (_, split) in scratch {
@@ -255,7 +267,9 @@ fn run<C: ActorCritic>(
             let began = Instant::now();
             let outcome = worker.environment.step(actions);
             physics += began.elapsed();
-            let mut reward = outcome.reward;
+            worker.discounted = worker.gamma * worker.discounted + outcome.reward;
+            worker.returns.push(&[worker.discounted]);
+            let mut reward = iteration.rewards.map_or(outcome.reward, |rewards| rewards.scaled(outcome.reward));
             if let Some((_, _, rules)) = iteration.companion {
                 let error = rules.error(&*worker.environment, &trajectory.acts[step * n..], plan);
                 trajectory.companion_errors.push(error);
@@ -274,6 +288,7 @@ fn run<C: ActorCritic>(
                 }
                 worker.episode += 1;
                 worker.actions.clear();
+                worker.discounted = 0.0;
                 worker.environment.reset(episode_seed(iteration.run_seed, worker.index, worker.episode));
                 trajectory.episodes.push(outcome);
             }

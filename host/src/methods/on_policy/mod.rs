@@ -4,8 +4,10 @@
 //! dimension or one a team ([`Ratio`]), and value a whole team or every module ([`Valued`]). The rest is here: rollouts ([`collect`]), the
 //! rollout buffer with generalised advantage estimation ([`buffer`]), minibatches and optimiser ([`update`]).
 
+pub mod autodiff;
 pub mod buffer;
 pub mod collect;
+pub mod losses;
 pub mod update;
 
 use std::time::Instant;
@@ -197,6 +199,7 @@ pub struct OnPolicy<C: ActorCritic> {
     companion: Option<CompanionLearner<C>>,
     observations: Running,
     privileged: Running,
+    returns: Running,
     environments: Vec<RolloutWorker>,
     buffer: RolloutBuffer,
     iteration: u64,
@@ -214,11 +217,12 @@ impl<C: ActorCritic> OnPolicy<C> {
     ) -> Result<Self> {
         let mut environments = Vec::with_capacity(settings.environments);
         for index in 0..settings.environments {
-            environments.push(RolloutWorker::new(checked(make(index)?, index)?, index, config.seed));
+            environments.push(RolloutWorker::new(checked(make(index)?, index)?, index, config.seed, settings.gamma));
         }
         Ok(Self {
             observations: Running::new(SIZE),
             privileged: Running::new(PRIVILEGED),
+            returns: Running::new(1),
             buffer: RolloutBuffer::new(settings.environments),
             environments,
             iteration: 0,
@@ -240,6 +244,12 @@ impl<C: ActorCritic> OnPolicy<C> {
         self.companion.as_ref().map(|companion| &companion.learner)
     }
 
+    /// The numbers of all normalisers that are in use.
+    fn statistics(&self) -> Vec<f64> {
+        let returns = self.settings.reward_clip.map(|_| self.returns.numbers());
+        self.observations.numbers().chain(self.privileged.numbers()).chain(returns.into_iter().flatten()).collect()
+    }
+
     fn learners(&self) -> impl Iterator<Item = &Learner<C>> {
         [Some(&self.control), self.companion.as_ref().map(|companion| &companion.learner)].into_iter().flatten()
     }
@@ -256,15 +266,19 @@ impl<C: ActorCritic> Algorithm for OnPolicy<C> {
         let iteration = Iteration {
             policy: &self.control.networks,
             companion: self.companion.as_ref().map(|c| (&c.learner.networks, c.learner.seed, &*c.rules)),
-            observations: Frozen::new(&self.observations),
+            observations: match self.settings.observation_clip {
+                Some(clip) => Frozen::with_clip(&self.observations, clip),
+                None => Frozen::off(),
+            },
             privileged: Frozen::new(&self.privileged),
+            rewards: self.settings.reward_clip.map(|clip| Frozen::with_clip(&self.returns, clip)),
             run_seed: self.config.seed,
             iteration: self.iteration,
             steps: self.settings.rollout_steps,
         };
-        let (observations, privileged) = (&mut self.observations, &mut self.privileged);
+        let statistics = [&mut self.observations, &mut self.privileged, &mut self.returns];
         let workers = &self.workspace.workers;
-        let split = collect(&mut self.environments, &mut self.buffer, &iteration, workers, observations, privileged);
+        let split = collect(&mut self.environments, &mut self.buffer, &iteration, workers, statistics);
         let rollout = began.elapsed();
         let linear = self
             .settings
@@ -343,8 +357,9 @@ impl<C: ActorCritic> Algorithm for OnPolicy<C> {
         State {
             iteration: self.iteration,
             learners: self.learners().map(Learner::state).collect(),
-            statistics: self.observations.numbers().chain(self.privileged.numbers()).collect(),
+            statistics: self.statistics(),
             episodes: self.environments.iter().map(episode).collect(),
+            replay: Vec::new(),
         }
     }
 
@@ -367,6 +382,12 @@ impl<C: ActorCritic> Algorithm for OnPolicy<C> {
             bail!("the checkpoint has too few statistics: it is of another version");
         };
         (self.observations, self.privileged) = (observations, privileged);
+        if self.settings.reward_clip.is_some() {
+            let Some(returns) = Running::from_numbers(1, &mut numbers) else {
+                bail!("the checkpoint has too few statistics: it is of another version");
+            };
+            self.returns = returns;
+        }
         if state.episodes.len() != self.environments.len() {
             bail!(
                 "the checkpoint has {} environments, the settings say {}",
@@ -376,8 +397,14 @@ impl<C: ActorCritic> Algorithm for OnPolicy<C> {
         }
         for (index, EpisodeState { number, actions }) in state.episodes.iter().enumerate() {
             let environment = checked(make(index)?, index)?;
-            self.environments[index] =
-                RolloutWorker::restore(environment, index, self.config.seed, *number, actions.clone());
+            self.environments[index] = RolloutWorker::restore(
+                environment,
+                index,
+                self.config.seed,
+                self.settings.gamma,
+                *number,
+                actions.clone(),
+            );
         }
         self.iteration = state.iteration;
         Ok(())

@@ -66,6 +66,10 @@ pub struct OnPolicySettings {
     pub sigma_min: f32,
     /// What the advantages are divided by.
     pub standardise: Standardise,
+    /// Observations are normalised and cut off at this; none: they go in raw.
+    pub observation_clip: Option<f32>,
+    /// Rewards are divided by the standard deviation of their running discounted sum and cut off at this; none: they stay as they are.
+    pub reward_clip: Option<f32>,
 }
 
 impl OnPolicySettings {

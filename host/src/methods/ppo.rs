@@ -1,0 +1,124 @@
+//! PPO (Schulman et al. 2017), central and zero-padded: one network takes the observations of all modules side by side and puts out all
+//! their torques, made for the longest snake; a shorter one fills the rest with zeros (after Chen et al. 2018). The paper's centralised baseline.
+//!
+//! Networks, losses and settings are those of vwxyzjn/cleanrl's ppo_continuous_action: separate actor and critic of 64-64 tanh, log_std free,
+//! from 0, one for each padded action; one ratio over all actions of the robot; the value's squared error counts 0.25, clipped like the ratio;
+//! one Adam and one limit of the gradient for both; advantages standardised in each minibatch; rewards divided by the standard deviation of
+//! their running discounted sum.
+//!
+//! Padding: modules head first, zeros at the tail, so that a longer snake keeps the places of the modules it shares. **The statistics of the
+//! observations are pooled over the modules that are there**, as for every method here. With statistics of its own for every input, a padded
+//! one would have a standard deviation of nearly 0 and the first real number there would be cut off at the limit: that decides what a ninth module
+//! does. Actions of padding count neither in the ratio nor in the entropy (naively they do; the authors' numbers are of that, and are met
+//! by a team of that length which sees zeros). Trained on eight modules alone, the places from the ninth on never learn.
+//!
+//! Mended here as in all baselines: an episode cut off by the time limit is worth what the critic says of its last view, which is that before
+//! the reset; statistics are one set for all environments, still during an iteration, and frozen for evaluation. The running
+//! discounted sum of rewards starts anew with every episode.
+
+use burn::tensor::Tensor;
+use composer_shared::observation::SIZE;
+
+use super::on_policy::autodiff::{Evaluation, Seen, TensorNetworks};
+use super::on_policy::collect::ACTIONS;
+use super::on_policy::losses::ValueLoss;
+use super::on_policy::{Ratio, Valued};
+use super::tensors::{Activation, Layout, Scheme, Weights};
+use super::{Method, SavedWeights, TrainedPolicy};
+
+/// Modules of the longest snake of the paper's tables.
+pub const MOST_MODULES: usize = 11;
+/// Width of the hidden layers.
+const WIDTH: usize = 64;
+
+/// Actor and critic for snakes of at most so many modules.
+#[derive(Clone, Copy, Debug)]
+pub struct Ppo {
+    /// The most modules.
+    pub modules: usize,
+}
+
+impl Ppo {
+    /// All observations of each team side by side, padded with zeros.
+    fn padded(self, w: &Weights, seen: &Seen) -> Tensor<2> {
+        let Seen { teams, modules, .. } = *seen;
+        // A module that the head does not hear is as absent as padding.
+        let present = seen.mask.clone().narrow(1, 0, 1).reshape([teams * modules, 1]).clamp(-1.0, 0.0) + 1.0;
+        let joint = (seen.observations.clone() * present).reshape([teams, modules * SIZE]);
+        let missing = (self.modules - modules) * SIZE;
+        if missing == 0 {
+            joint
+        } else {
+            Tensor::cat(vec![joint, w.tensor(&vec![0.0; teams * missing], [teams, missing])], 1)
+        }
+    }
+}
+
+impl TensorNetworks for Ppo {
+    fn layouts(&self) -> [Layout; 2] {
+        let mut layout = Layout::default();
+        let gain = Scheme::Orthogonal(std::f32::consts::SQRT_2);
+        for (of, outputs, last) in [("actor_mean", self.modules * ACTIONS, 0.01), ("critic", 1, 1.0)] {
+            layout.linear(&format!("{of}.0"), self.modules * SIZE, WIDTH, gain);
+            layout.linear(&format!("{of}.2"), WIDTH, WIDTH, gain);
+            layout.linear(&format!("{of}.4"), WIDTH, outputs, Scheme::Orthogonal(last));
+        }
+        layout.vector("actor_logstd", self.modules * ACTIONS, 0.0);
+        [layout, Layout::default()]
+    }
+
+    fn most_modules(&self) -> Option<usize> {
+        Some(self.modules)
+    }
+
+    fn ratio(&self) -> Ratio {
+        Ratio::Team
+    }
+
+    fn valued(&self) -> Valued {
+        Valued::Team
+    }
+
+    fn value_loss(&self) -> ValueLoss {
+        ValueLoss { coefficient: 0.5, huber: None }
+    }
+
+    fn entropy_sums(&self) -> [bool; 2] {
+        [true, true]
+    }
+
+    fn evaluate(&self, w: &Weights, seen: &Seen, _actions: Tensor<2>) -> Evaluation {
+        let (means, sigma) = self.distribution(w, seen);
+        Evaluation { means, sigma, values: self.values(w, seen) }
+    }
+
+    fn values(&self, w: &Weights, seen: &Seen) -> Tensor<2> {
+        w.mlp(&["critic.0", "critic.2", "critic.4"], Activation::Tanh, self.padded(w, seen))
+    }
+
+    fn distribution(&self, w: &Weights, seen: &Seen) -> (Tensor<2>, Tensor<2>) {
+        let Seen { teams, modules, .. } = *seen;
+        let (all, rows) = (modules * ACTIONS, [teams * modules, ACTIONS]);
+        let means = w.mlp(&["actor_mean.0", "actor_mean.2", "actor_mean.4"], Activation::Tanh, self.padded(w, seen));
+        let sigma = w.get("actor_logstd").exp().narrow(1, 0, all).repeat(&[teams, 1]);
+        (means.narrow(1, 0, all).reshape(rows), sigma.reshape(rows))
+    }
+
+    fn log_sigma(&self, parameters: &[f32]) -> Vec<f32> {
+        parameters[self.layouts()[0].range("actor_logstd")].to_vec()
+    }
+
+    fn policy(&self, parameters: &[f32], mean: [f32; SIZE], std: [f32; SIZE]) -> TrainedPolicy {
+        let saved = SavedWeights::raw(Method::Ppo, parameters);
+        TrainedPolicy::Weights(SavedWeights {
+            modules: self.modules,
+            mean: mean.to_vec(),
+            std: std.to_vec(),
+            clip: OBSERVATION_CLIP,
+            ..saved
+        })
+    }
+}
+
+/// Normalised observations are cut off here.
+pub const OBSERVATION_CLIP: f32 = 10.0;
