@@ -7,8 +7,9 @@ use rand_chacha::ChaCha8Rng;
 use crate::environment::{Environment, Outcome, View};
 use crate::tasks::Point;
 
-/// Pendulum-v1: swing up and hold a pendulum with a motor too weak to lift it at once. Observed are cosine and sine of the angle from
-/// upright and the speed in rad/s. The first action is the torque by its limit of 2. An episode has 200 steps and is cut off there.
+/// Pendulum-v1: swing up and hold a pendulum with a motor too weak to lift it at once. Observed are cosine and sine of the angle from upright
+/// and the speed by its limit of 8 rad/s (there in rad/s; SMP keeps the direction of what it sees, not its size). The first action is the
+/// torque by its limit of 2. An episode has 200 steps and is cut off there.
 #[derive(Clone, Debug, Default)]
 pub struct Pendulum {
     /// Angle from upright, rad.
@@ -38,7 +39,7 @@ impl Environment for Pendulum {
     fn view(&self, view: &mut View) {
         view.clear(1);
         let (sin, cos) = libm::sincos(self.angle);
-        view.observations[0][..3].copy_from_slice(&[cos as f32, sin as f32, self.speed as f32]);
+        view.observations[0][..3].copy_from_slice(&[cos as f32, sin as f32, self.speed as f32 / 8.0]);
     }
 
     fn step(&mut self, actions: &[[f32; 2]]) -> Outcome {

@@ -357,3 +357,41 @@ impl<N: TensorNetworks> Policy for TensorPolicy<'_, N> {
         actions.resize(all, [0.0; ACTIONS]);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Gains of the initial matrices by the end of their names; the biases are zeros.
+    fn gains<N: TensorNetworks>(networks: N, expected: &[(&str, f32)], other: f32) {
+        let learner = learner(networks, 3, Forgetting::Off, 1e-3);
+        let (layout, parameters) = (learner.networks.layout(), learner.networks.parameters());
+        for entry in layout.entries().iter().filter(|entry| entry.rows > 1) {
+            // All singular values of an orthogonal matrix times a gain are the gain.
+            let square: f32 = parameters[entry.range()].iter().map(|w| w * w).sum();
+            let gain = (square / entry.rows.min(entry.columns) as f32).sqrt();
+            let of = |(end, _): &&(&str, f32)| entry.name.ends_with(&format!("{end}.weight"));
+            let expected = expected.iter().find(of).map_or(other, |(_, gain)| *gain);
+            assert!((gain - expected).abs() < 1e-4, "{}: {gain} instead of {expected}", entry.name);
+        }
+        for entry in layout.entries().iter().filter(|entry| entry.name.ends_with("bias")) {
+            assert!(
+                entry.name.contains("_bias") || parameters[entry.range()].iter().all(|b| *b == 0.0),
+                "{}",
+                entry.name
+            );
+        }
+    }
+
+    #[test]
+    fn initial_weights_have_the_authors_gains() {
+        let root2 = std::f32::consts::SQRT_2;
+        let small = ["query", "key", "value", "proj", "mlp.2", "decoder.head.3"].map(|name| (name, 0.01));
+        gains(Mat, &small, root2);
+        gains(MatDec, &[&small[..], &[("decoder.mlp.7", 0.01)]].concat(), root2);
+        for networks in [Mappo::harl(8), Mappo::on_policy(8)] {
+            gains(networks, &[("fc_mean", 0.01)], root2);
+        }
+        gains(Ppo { modules: 11 }, &[("actor_mean.4", 0.01)], root2);
+    }
+}

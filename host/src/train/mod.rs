@@ -350,7 +350,15 @@ mod tests {
         for method in BASELINES {
             let config = small_baseline(method);
             let mut straight = Trainer::new(&TrainConfig { threads: 2, ..config.clone() }, teams, "trivial").unwrap();
-            (0..4).for_each(|_| drop(straight.iterate().unwrap()));
+            let report = straight.iterate().unwrap();
+            if method != Method::Smp {
+                // Acting and scoring agree: before anything is learnt the ratio is 1, with a dead module too.
+                let kl = report.get("losses/first_minibatch_kl");
+                assert!(kl.abs() < 1e-6, "{method}: {kl}");
+                let sigma = if method == Method::Ppo { 1.0 } else { 0.3655 };
+                assert!((report.get("charts/sigma") - sigma).abs() < 0.01, "{method}");
+            }
+            (0..3).for_each(|_| drop(straight.iterate().unwrap()));
             let mut first = Trainer::new(&TrainConfig { threads: 1, ..config.clone() }, teams, "trivial").unwrap();
             (0..2).for_each(|_| drop(first.iterate().unwrap()));
             let folder = tempfile::tempdir().unwrap();

@@ -1,8 +1,8 @@
 //! On-policy learning with clipped losses (PPO's and its relatives'): what all such methods share.
 //!
 //! A method brings its networks, as an [`ActorCritic`]; it may let the ratio of new to old density be one a module, one an action
-//! dimension or one a team ([`Ratio`]), and value a whole team or every module ([`Valued`]). The rest is here: rollouts ([`collect`]), the
-//! rollout buffer with generalised advantage estimation ([`buffer`]), minibatches and optimiser ([`update`]).
+//! dimension or one a team ([`Ratio`]), and value a whole team or every module ([`Valued`]). The rest is here: rollouts ([`mod@collect`]), the
+//! rollout buffer with generalised advantage estimation ([`buffer`]), minibatches and optimiser ([`mod@update`]).
 
 pub mod autodiff;
 pub mod buffer;
