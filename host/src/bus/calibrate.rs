@@ -582,7 +582,7 @@ mod tests {
     #[test]
     fn limits_lie_inside_of_the_ends_and_around_zero() {
         assert_eq!(limits(-1.25, 1.0, 0.25).unwrap(), (-1.0, 0.75));
-        assert_eq!(limits(-3.14, 3.14, 0.02).unwrap(), (-3.1, 3.1));
+        assert_eq!(limits(-3.15, 3.15, 0.02).unwrap(), (-3.1, 3.1));
         assert!(limits(0.2, 1.0, 0.05).unwrap_err().to_string().contains("is it zeroed, and free?"));
         assert!(limits(-0.05, 0.05, 0.05).is_err());
     }

@@ -294,7 +294,10 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             let text = config::dump(&mut station)?.to_toml();
             match output {
                 Some(path) => write_whole(path, text.as_bytes()),
-                None => Ok(print!("{text}")),
+                None => {
+                    print!("{text}");
+                    Ok(())
+                }
             }
         }
         Verb::Restore { file } => {

@@ -36,6 +36,7 @@ struct Arguments {
 }
 
 #[derive(Subcommand)]
+#[allow(clippy::large_enum_variant)] // There is one, once.
 enum Verb {
     /// Train a policy from nothing.
     Train(train::Arguments),
