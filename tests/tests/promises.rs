@@ -152,7 +152,7 @@ fn a_comparison_is_made_from_nothing_and_what_is_done_is_not_done_again() {
     };
     refuse(folder.path(), &[&report("2048")[..], &["--so-far"]].concat(), &["none of the 4 runs in r is done"]);
     let table = succeed(folder.path(), &report("2048"));
-    for method in ["| mappo |", "| composer-no-imagination |"] {
+    for method in ["| composer-neither |", "| composer-no-imagination |"] {
         assert_eq!(table.matches(method).count(), 2, "{table}");
     }
     let read = |name: &str| std::fs::read_to_string(folder.path().join("o").join(name)).unwrap();
@@ -163,11 +163,11 @@ fn a_comparison_is_made_from_nothing_and_what_is_done_is_not_done_again() {
         assert_eq!(run["final"]["none"]["episodes"], 2, "{run}");
     }
     // A run that was killed before its judgement ended is judged again and comes to the same.
-    let run = folder.path().join("r/mappo-head-1");
+    let run = folder.path().join("r/composer-neither-head-1");
     let (result, metrics) = (std::fs::read(run.join("result.json")).unwrap(), std::fs::read(run.join("metrics.jsonl")));
     std::fs::remove_file(run.join("result.json")).unwrap();
     let so_far = succeed(folder.path(), &[&report("2048")[..], &["--so-far"]].concat());
-    assert!(so_far.contains("3 of 4 runs are done") && so_far.matches("| mappo |").count() == 1, "{so_far}");
+    assert!(so_far.contains("3 of 4 runs are done") && so_far.matches("| composer-neither |").count() == 1, "{so_far}");
     assert_eq!(succeed(folder.path(), &report("2048")), table);
     assert_eq!(std::fs::read(run.join("result.json")).unwrap(), result);
     assert_eq!(std::fs::read(run.join("metrics.jsonl")).unwrap(), metrics.unwrap());
