@@ -7,6 +7,7 @@ use std::vec::Vec;
 use proptest::prelude::*;
 
 use super::*;
+use crate::registers::Register;
 use crate::robot::MAX_MODULES;
 
 const DOCUMENT: &str = include_str!("../../wire-format.md");
@@ -60,6 +61,28 @@ fn examples() -> Vec<(Message, u8, &'static str)> {
             }),
             3,
             "383#0207060000000000",
+        ),
+        (
+            Message::ServiceRequest(ServiceRequest {
+                destination: 3,
+                operation: Operation::Read as u8,
+                sequence: 8,
+                index: Register::JointAngle.spec().first,
+                value: 0,
+            }),
+            STATION,
+            "37F#0305084400000000",
+        ),
+        (
+            Message::ServiceResponse(ServiceResponse {
+                operation: Operation::Read as u8,
+                sequence: 8,
+                code: ServiceCode::Ok as u8,
+                index: Register::JointAngle.spec().first,
+                value: 0.5f32.to_bits(),
+            }),
+            3,
+            "383#050800440000003F",
         ),
         (
             Message::Telemetry(Telemetry {
