@@ -370,10 +370,9 @@ impl Outbox {
 struct Jog {
     axis: usize,
     torque: f32,
-    /// When it ends.
-    until: Micros,
-    /// When the torque was last stepped.
-    stepped: Micros,
+    time_us: u32,
+    /// When the torque was last stepped, and when it ends; none before the next poll, because what was known of the time is old.
+    times: Option<(Micros, Micros)>,
 }
 
 /// A SYNC that would move the cycle to quite another number.
@@ -473,6 +472,8 @@ pub struct Controller<'a> {
     last_station: Micros,
     last_act: Option<Micros>,
 
+    /// When the torque was last taken to zero.
+    relaxed_at: Option<Micros>,
     torque: [f32; AXES],
     enabled: bool,
     limited_by: LimitedBy,
@@ -529,6 +530,7 @@ impl<'a> Controller<'a> {
             last_heard: now,
             last_station: now,
             last_act: None,
+            relaxed_at: None,
             torque: [0.0; AXES],
             enabled: false,
             limited_by: LimitedBy::Relaxed,
@@ -648,14 +650,16 @@ impl<'a> Controller<'a> {
     /// Allows the motors to be driven; `acknowledge`: even after a reset that was not clean. The error is [`ServiceCode::NotArmable`].
     pub fn arm(&mut self, acknowledge: bool) -> Result<(), ServiceCode> {
         self.failsafe.arm(acknowledge)?;
-        self.jog = None;
+        if self.jog.is_some() {
+            self.relax();
+        }
         Ok(())
     }
 
-    /// Takes that back. The motors relax with the next poll.
+    /// Takes that back.
     pub fn disarm(&mut self) {
         self.failsafe.disarm();
-        self.jog = None;
+        self.relax();
     }
 
     /// Whether the station has armed it.
@@ -687,8 +691,7 @@ impl<'a> Controller<'a> {
         if !self.failsafe.fit() || self.faults().meets(FaultSet::FORBIDDING) {
             return Err(ServiceCode::NotArmable);
         }
-        let until = self.now.saturating_add(u64::from(time_us));
-        self.jog = (torque != 0.0 && time_us != 0).then_some(Jog { axis, torque, until, stepped: self.now });
+        self.jog = (torque != 0.0 && time_us != 0).then_some(Jog { axis, torque, time_us, times: None });
         Ok(())
     }
 
@@ -829,7 +832,8 @@ impl<'a> Controller<'a> {
 
     /// Listen before you talk; longer if somebody else seems to have the same number.
     fn listening(&self) -> bool {
-        let suspected = !self.spoken && self.conflict.suspected(self.now, self.periods(3));
+        let certain = self.faults().contains(Fault::DuplicateNode);
+        let suspected = !self.spoken && !certain && self.conflict.suspected(self.now, self.periods(3));
         suspected || self.now.saturating_sub(self.power_up) < self.period()
     }
 
@@ -1206,14 +1210,13 @@ impl<'a> Controller<'a> {
         self.used = if self.policy.attention() { self.neighbours.usable() } else { 0 };
         let (own, latents) = (self.own(), self.neighbours.latents());
         let action = self.policy.act(&encoded, latents, self.used, Some(&mut self.attention), own);
-        // As fast as the time since the last action allows; a period at most, which is what the policy was trained with.
+        // As fast as the time since the torque was set allows; a period at most, which is what the policy was trained with.
         let period = self.period();
-        let seconds = self.last_act.map_or(period, |last| self.now.saturating_sub(last).min(period)) as f32 / 1e6;
-        // In a jog the station drives.
+        let set = self.last_act.max(self.relaxed_at).unwrap_or(self.power_up);
+        let seconds = self.now.saturating_sub(set).min(period) as f32 / 1e6;
+        // A jog goes on.
         if self.jog.is_none() {
-            let (torque, limited_by) = self.failsafe.command(self.torque, action, seconds);
-            self.torque = torque;
-            self.limited_by = limited_by;
+            (self.torque, self.limited_by) = self.failsafe.command(self.torque, action, seconds);
             self.enabled = !self.failsafe.relaxed();
         }
         self.last_act = Some(self.now);
@@ -1248,11 +1251,19 @@ impl<'a> Controller<'a> {
         self.failsafe.set(Fault::Isolated, isolated);
         let jogged = self.jog.is_some() && self.may_jog();
         if self.failsafe.relaxed() && !jogged {
-            self.torque = [0.0; AXES];
-            self.enabled = false;
-            self.limited_by = LimitedBy::Relaxed;
-            self.jog = None;
+            self.relax();
         }
+    }
+
+    /// No torque, and no jog.
+    fn relax(&mut self) {
+        if self.enabled {
+            self.relaxed_at = Some(self.now);
+        }
+        self.torque = [0.0; AXES];
+        self.enabled = false;
+        self.limited_by = LimitedBy::Relaxed;
+        self.jog = None;
     }
 
     fn may_jog(&self) -> bool {
@@ -1262,14 +1273,11 @@ impl<'a> Controller<'a> {
     /// Drives the axis that the station wants to move.
     fn step_jog(&mut self) {
         let Some(jog) = self.jog else { return };
-        if self.now >= jog.until {
-            self.jog = None;
-            self.torque = [0.0; AXES];
-            self.enabled = false;
-            self.limited_by = LimitedBy::Relaxed;
-            return;
+        let (stepped, until) = jog.times.unwrap_or((self.now, self.now.saturating_add(jog.time_us.into())));
+        if self.now >= until {
+            return self.relax();
         }
-        let seconds = self.now.saturating_sub(jog.stepped).min(self.period()) as f32 / 1e6;
+        let seconds = self.now.saturating_sub(stepped).min(self.period()) as f32 / 1e6;
         let mut torque = [0.0; AXES];
         for (axis, (torque, before)) in torque.iter_mut().zip(self.torque).enumerate() {
             let wanted = if axis == jog.axis { jog.torque / self.limits.torque } else { 0.0 };
@@ -1278,7 +1286,7 @@ impl<'a> Controller<'a> {
         self.torque = torque;
         self.enabled = true;
         self.limited_by = LimitedBy::Nothing;
-        self.jog = Some(Jog { stepped: self.now, ..jog });
+        self.jog = Some(Jog { times: Some((self.now, until)), ..jog });
     }
 
     /// Queues a HEARTBEAT: every [`REPORT_EVERY`] periods, and when the faults change, but never more than one a period. And a stop
@@ -1339,8 +1347,8 @@ impl<'a> Controller<'a> {
             at(self.last_sync.saturating_add(self.periods(timing.sync_lost_after) + 1));
         }
         at(self.last_heard.saturating_add(self.periods(timing.isolated_after) + 1));
-        if let Some(jog) = &self.jog {
-            at(jog.until.min(self.now.saturating_add(JOG_STEP_US)));
+        if let Some((_, until)) = self.jog.and_then(|jog| jog.times) {
+            at(until.min(self.now.saturating_add(JOG_STEP_US)));
         }
         // The clock cannot go beyond the end of time; nothing else can make this fail.
         deadline.max(self.now.saturating_add(1))

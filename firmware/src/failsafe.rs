@@ -457,6 +457,7 @@ impl Failsafe {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::format;
 
     fn failsafe() -> Failsafe {
         let limits =
@@ -482,6 +483,44 @@ mod tests {
             set.set(fault, false);
             assert!(set.is_empty());
         }
+    }
+
+    /// The table in `shared`, which `wire-format.md` prints, against what happens.
+    #[test]
+    fn every_fault_does_what_the_table_says_and_ends_by_what_it_says() {
+        let document = include_str!("failsafe.rs");
+        for fault in Fault::ALL {
+            let mut failsafe = failsafe();
+            failsafe.check_joints(&level());
+            failsafe.set(fault, true);
+            let relaxed = matches!(fault.effect(), Effect::Relaxed | Effect::Disarmed | Effect::Silent);
+            assert_eq!(failsafe.relaxed(), relaxed, "{fault:?}");
+            let (torque, limited_by) = failsafe.command([0.0; 2], [0.1; 2], 0.05);
+            assert_eq!((torque == [0.0; 2], limited_by == LimitedBy::Relaxed), (relaxed, relaxed), "{fault:?}");
+            assert_eq!(failsafe.silenced(), fault.effect() == Effect::Silent || fault == Fault::BusOff, "{fault:?}");
+            failsafe.disarm();
+            assert_eq!(failsafe.arm(false).is_err(), fault.forbids_arming(), "{fault:?}");
+            for by in [Clearing::Release, Clearing::Clear, Clearing::Acknowledgement] {
+                let mut failsafe = failsafe.clone();
+                failsafe.clear(by);
+                assert_eq!(failsafe.faults().contains(fault), by != fault.clearing(), "{fault:?} {by:?}");
+            }
+            // The module's documentation says what sets it.
+            let number = format!("{} {fault:?}", fault as u8);
+            let rows = document.lines().filter(|line| line.starts_with("//! | ") && line.contains(&number));
+            assert_eq!(rows.count(), 1, "{number}");
+        }
+        // What disarms: the two that happen while armed do.
+        let mut failsafe = failsafe();
+        failsafe.check_station(2_000_001);
+        assert!(!failsafe.armed() && failsafe.faults().contains(Fault::StationLost));
+        failsafe.check_station(0);
+        assert!(failsafe.faults().is_empty() && failsafe.relaxed());
+        failsafe.arm(false).unwrap();
+        failsafe.command_stop(StopCommand::Stop, StopCount::UNKNOWN);
+        assert!(!failsafe.armed());
+        failsafe.command_stop(StopCommand::Release, StopCount::UNKNOWN);
+        assert!(failsafe.faults().is_empty() && failsafe.relaxed());
     }
 
     #[test]

@@ -389,6 +389,23 @@ mod tests {
         assert_eq!((neighbours.usable(), neighbours.latents()[2].value[31]), (0b0100, -31));
     }
 
+    /// Pieces of two latents of 16 cycles apart have the same number outside.
+    #[test]
+    fn fragments_of_two_latents_do_not_mix_when_the_cycle_jumps_by_16() {
+        let mut neighbours = started(40);
+        for piece in &latent(40).fragments()[1..] {
+            neighbours.hear_fragment(2, piece).unwrap();
+        }
+        neighbours.start(56);
+        let other = LatentMessage { value: [7; 32], ..latent(56) };
+        assert_eq!(neighbours.hear_fragment(2, &other.fragments()[0]), Ok(Heard::Incomplete));
+        assert_eq!(neighbours.usable(), 0);
+        for piece in &other.fragments()[1..] {
+            neighbours.hear_fragment(2, piece).unwrap();
+        }
+        assert_eq!((neighbours.usable(), neighbours.latents()[2].value), (0b0100, [7; 32]));
+    }
+
     #[test]
     fn pieces_of_different_cycles_never_mix() {
         let mut neighbours = started(40);

@@ -12,7 +12,9 @@ use proptest::prelude::*;
 
 use super::*;
 
+mod arming;
 mod limits;
+mod schedules;
 
 const PERIOD: Micros = 50_000;
 const SECOND: Micros = 1_000_000;
@@ -124,7 +126,7 @@ impl Net {
         let config = Config { safety: self.safety, ..config };
         let i = usize::from(node);
         self.nodes[i] = Some(Controller::new(config, self.policy, boot, self.now).unwrap());
-        self.outputs[i].deadline = self.now;
+        self.outputs[i] = Outputs { torque: [0.0; AXES], motors_enabled: false, deadline: self.now };
     }
 
     fn unplug(&mut self, node: usize) {
@@ -146,6 +148,9 @@ impl Net {
             assert!(outputs.deadline > self.now);
             assert!(outputs.torque.iter().all(|t| t.abs() <= self.policy.limits().torque));
             assert!(outputs.motors_enabled || outputs.torque == [0.0; 2]);
+            let may_drive =
+                controller.mode() != Mode::Stopped && (controller.armed() || controller.mode() == Mode::Service);
+            assert!(may_drive || !outputs.motors_enabled, "module {node} drives, and nobody allowed it");
             self.outputs[node] = outputs;
         }
     }

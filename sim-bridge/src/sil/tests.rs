@@ -6,6 +6,8 @@ use crate::faults::FaultPlan;
 use composer_shared::policy::{IMAGE_SIZE, random_image};
 use composer_shared::wire::{EmergencyStop, Fault as Trouble, Message, StopCount};
 
+mod safety;
+
 const MS: u64 = 1_000_000;
 
 /// Joints whose speed follows the torque; whatever was applied is kept.
