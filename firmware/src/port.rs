@@ -218,6 +218,7 @@ impl Sender {
     }
 
     /// Takes a frame to send. It goes to a slot with the next [`Sender::poll`].
+    #[inline(never)] // The linked image is checked from here on: `tests/tests/image.rs`.
     pub fn push(&mut self, now: Micros, frame: &Frame) {
         for loaded in self.slots.iter_mut().flatten() {
             if supersedes(frame, &loaded.queued.frame) {
@@ -236,6 +237,7 @@ impl Sender {
     }
 
     /// Goes on to `now`: looks what became of the frames in the slots, gives up what is out of date, and fills the slots with the most urgent.
+    #[inline(never)] // Like `push`.
     pub fn poll(&mut self, now: Micros, slots: &mut impl Slots) {
         self.collect(slots);
         self.give_up(now);

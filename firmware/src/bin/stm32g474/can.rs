@@ -13,10 +13,11 @@ use core::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
 use composer_firmware::controller::{BusStatus, Micros};
 use composer_firmware::failsafe::BusOffPolicy;
-use composer_firmware::port::{CanPort, Counts, Outcome, PortStatus, RECEIVED, Sender, Slots, element};
+use composer_firmware::port::{CanPort, Counts, Outcome, PortStatus, RECEIVED, SLOTS, Sender, Slots, element};
 use composer_shared::wire::{Frame, Function};
 use embassy_stm32::gpio::{AfType, Flex, OutputType, Pull, Speed};
 use embassy_stm32::interrupt::InterruptExt;
+use embassy_stm32::pac::can::regs;
 use embassy_stm32::pac::can::vals::{Anfe, Anfs, Tfqm};
 use embassy_stm32::peripherals::{FDCAN1, PA11, PA12};
 use embassy_stm32::{Peri, interrupt, pac, rcc};
@@ -54,21 +55,24 @@ pub struct Fdcan {
 /// The transmit buffers.
 struct Buffers;
 
+// The bits of a slot as they are, without the checks of the register definitions: they could panic.
 impl Slots for Buffers {
     fn load(&mut self, slot: usize, frame: &Frame) {
-        element::encode(frame, |number, word| RAM.txbuf(element::WORDS * slot + number).write_value(word));
-        CAN.txbar().write(|w| w.set_ar(slot, true));
+        // A slot and a word beyond the last would be the last; there are none.
+        let word = |number: usize| RAM.txbuf((element::WORDS * slot + number).min(element::WORDS * SLOTS - 1));
+        element::encode(frame, |number, value| word(number).write_value(value));
+        CAN.txbar().write_value(regs::Txbar(1 << slot));
     }
 
     fn abort(&mut self, slot: usize) {
-        CAN.txbcr().write(|w| w.set_cr(slot, true));
+        CAN.txbcr().write_value(regs::Txbcr(1 << slot));
     }
 
     fn outcome(&mut self, slot: usize) -> Outcome {
         // A request stays pending until the frame got through or, asked back, is off the wire.
-        if CAN.txbrp().read().trp(slot) {
+        if CAN.txbrp().read().0 >> slot & 1 == 1 {
             Outcome::Pending
-        } else if CAN.txbto().read().to(slot) {
+        } else if CAN.txbto().read().0 >> slot & 1 == 1 {
             Outcome::Sent
         } else {
             Outcome::Returned
