@@ -7,11 +7,14 @@
 //! | rule | what must hold |
 //! |---|---|
 //! | `torque_limit` | no module applies more than the policy's torque limit |
-//! | `slew` | no torque changes faster than the slew limit, but for relaxing to zero |
+//! | `slew` | no torque changes faster than the slew limit, but for letting go; not even when a module is armed, released or plugged in |
 //! | `unplugged` | a module without power applies no torque |
 //! | `stopped` | a module whose emergency stop was latched a control cycle ago, and is, applies no torque |
+//! | `stop_holds` | on an undisturbed line every module is stopped a control cycle after the station's stop, and stays so until its release |
 //! | `one_time_keeper` | some cycles after the last disturbance the modules of each piece of cable follow one time-keeper |
-//! | `dead_masked` | nobody attends to a module that has been gone for longer than it takes to see it |
+//! | `takeovers` | on a line without losses nobody takes the time over without need |
+//! | `dead_masked` | nobody attends to a module that was gone before the last cycle began: of the next it may have spoken, if its own clock ran ahead |
+//! | `dead_seen` | a module that is gone is believed alive for as many cycles as a neighbour may be silent, and no longer |
 //! | `alive_again` | some cycles after the last disturbance all modules of a piece of cable believe each other alive |
 //! | `attention` | the attention weights of an action sum to one |
 //! | `panic` | nothing panics |
@@ -43,8 +46,12 @@ pub const LENGTH_NS: u64 = 3_000_000_000;
 const GRAIN_NS: u64 = 5_000_000;
 /// Control cycles in which the line must have settled after a disturbance.
 const SETTLED: u64 = 12;
-/// Control cycles after which a module that is gone must be seen to be: those of the controller, one for the cycle that runs, and one for a frame on its way.
-const SEEN: u64 = composer_shared::robot::DEAD_AFTER as u64 + 2;
+/// Control cycles, that in which it goes included, in which a module that is gone may still be believed alive.
+const SEEN: u64 = composer_shared::robot::DEAD_AFTER as u64 + 1;
+/// Periods in which a torque may go without a new one, when cycles are lost.
+const LOST_CYCLES: u64 = 3;
+/// Takeovers that something unplugged, plugged in, cut or mended may bring with it on either side.
+const TAKEOVERS: u32 = 3;
 /// Most runs that shrinking a schedule may take.
 const SHRINKING: usize = 400;
 
@@ -142,9 +149,9 @@ impl Schedule {
                 0 | 1 => fault(FaultKind::Unplug(target)),
                 // A brown-out.
                 2 => Item::Fault(PlannedFault {
-                    kind: FaultKind::Unplug(target),
+                    kind: FaultKind::BrownOut(target),
                     at_ns: Some(at),
-                    until_ns: Some(at + rng.random_range(2..=20) * GRAIN_NS),
+                    until_ns: Some(at + rng.random_range(1..=20) * GRAIN_NS),
                 }),
                 3 if modules > 1 => fault(FaultKind::Cut(Some(module.min(modules - 2)))),
                 4 => fault(FaultKind::Action(target)),
@@ -281,7 +288,7 @@ impl<L: Launcher + Sync> Campaign<'_, L> {
     pub fn run(&self, schedule: &Schedule, number: u64) -> anyhow::Result<Option<Broken>> {
         let seed = episode_seed(self.seed, number);
         let sil = schedule.sil(seed, self.config.robot.modules);
-        let mut plant = Watched::new(SnakePlant::new(self.config.clone(), seed), &self.config);
+        let mut plant = Watched::new(SnakePlant::new(self.config.clone(), seed), &self.config, &sil);
         let mut rules = Rules::new(&self.config, &sil);
         let run = catch_unwind(AssertUnwindSafe(|| {
             sil::run_on(self.launcher, &mut plant, self.policy, &sil, None, &mut |view, plant: &Watched| {
@@ -293,7 +300,7 @@ impl<L: Launcher + Sync> Campaign<'_, L> {
         }));
         match run {
             Ok(report) => {
-                report?;
+                rules.end(&report?);
                 Ok(rules.broken)
             }
             Err(panic) => {
@@ -338,20 +345,24 @@ struct Watched {
     slew: f32,
     torque: Vec<[f32; AXES]>,
     changed_ns: Vec<u64>,
+    /// Modules whose motors die and come back: what they do then is not the controller's.
+    dying: u64,
     period_ns: u64,
     now_ns: u64,
     broken: Option<Broken>,
 }
 
 impl Watched {
-    fn new(plant: SnakePlant, config: &EnvConfig) -> Self {
+    fn new(plant: SnakePlant, config: &EnvConfig, sil: &SilConfig) -> Self {
         let modules = config.robot.modules;
+        let dead = |f: &ScheduledFault| if let Fault::ActuatorDead(module) = f.fault { 1 << module } else { 0 };
         Watched {
             plant,
             limit: config.robot.torque_limit,
             slew: config.robot.torque_slew,
             torque: vec![[0.0; AXES]; modules],
             changed_ns: vec![0; modules],
+            dying: sil.faults.iter().map(dead).fold(0, |all: u64, one: u64| all | one),
             period_ns: (f64::from(config.control_period) * 1e9) as u64,
             now_ns: 0,
             broken: None,
@@ -388,11 +399,11 @@ impl Plant for Watched {
             if !(new.abs() <= self.limit * 1.000_001) {
                 self.broke("torque_limit", format!("module {module} applied {new}"));
             }
-            // Two actions may come a little closer than a period; what the plant sees moves by whole steps.
-            let since = (self.now_ns - self.changed_ns[module]).max(self.period_ns) + self.plant.step_ns();
-            let most = self.slew * since as f32 * 1e-9 + 0.01 * self.limit;
-            // Letting go is no slewing; nor is a motor that died or came back.
-            if new != 0.0 && was[axis] != 0.0 && (new - was[axis]).abs() > most {
+            // What the plant sees moves by whole steps.
+            let since = (self.now_ns - self.changed_ns[module]).clamp(self.period_ns, LOST_CYCLES * self.period_ns);
+            let most = self.slew * (since + self.plant.step_ns()) as f32 * 1e-9 + 0.01 * self.limit;
+            // Letting go is no slewing.
+            if new != 0.0 && self.dying & 1 << module == 0 && (new - was[axis]).abs() > most {
                 self.broke(
                     "slew",
                     format!("module {module} went from {} to {new} in {:.1} ms", was[axis], since as f64 * 1e-6),
@@ -419,10 +430,14 @@ impl Plant for Watched {
 
 /// The rules that are looked at once a control cycle.
 struct Rules<'a> {
-    faults: &'a [ScheduledFault],
     period_ns: u64,
     /// Whether nothing that goes on disturbs the frames for good.
     line: Vec<ScheduledFault>,
+    orders: &'a [(u64, StopCommand)],
+    /// Whether no frame is lost, late or twice, and all clocks are exact.
+    lossless: bool,
+    /// Cycle of each module at the last look, and how many it has started one a period until now.
+    in_step: Vec<(u16, u32)>,
     /// Modules stopped at the end of the last cycle.
     stopped: u64,
     broken: Option<Broken>,
@@ -434,10 +449,15 @@ impl<'a> Rules<'a> {
         let disturbs = |fault: &&ScheduledFault| {
             !matches!(fault.fault, Fault::ActuatorDead(_) | Fault::SensorZeroed(_) | Fault::SensorStuck(_))
         };
+        let plain =
+            |fault: &ScheduledFault| matches!(fault.fault, Fault::Unplug(_) | Fault::BrownOut(_) | Fault::Cut(_));
+        let line: Vec<ScheduledFault> = sil.faults.iter().filter(disturbs).copied().collect();
         Rules {
-            faults: &sil.faults,
+            lossless: line.iter().all(plain) && sil.clocks.iter().all(|clock| clock.drift_ppb == 0),
+            orders: &sil.commands,
             period_ns: (f64::from(config.control_period) * 1e9).round() as u64,
-            line: sil.faults.iter().filter(disturbs).copied().collect(),
+            line,
+            in_step: vec![(0, 0); config.robot.modules],
             stopped: 0,
             broken: None,
         }
@@ -449,7 +469,7 @@ impl<'a> Rules<'a> {
 
     /// Whether the line has had so many cycles to settle, and nothing disturbs it.
     fn quiet_for(&self, now: u64, cycles: u64) -> bool {
-        let lasting = |fault: &Fault| matches!(fault, Fault::Unplug(_) | Fault::Cut(_));
+        let lasting = |fault: &Fault| matches!(fault, Fault::Unplug(_) | Fault::BrownOut(_) | Fault::Cut(_));
         self.line.iter().all(|scheduled| {
             let over = |at: u64| now < at || now >= at + cycles * self.period_ns;
             // A module that is gone or a cable that is cut stays so without disturbing anybody.
@@ -461,6 +481,10 @@ impl<'a> Rules<'a> {
     fn cycle(&mut self, view: &CycleView) {
         let now = view.at_ns;
         let mut stopped = 0u64;
+        for ((last, steps), module) in self.in_step.iter_mut().zip(view.modules) {
+            *steps = if module.plugged && module.cycle == last.wrapping_add(1) { *steps + 1 } else { 0 };
+            *last = module.cycle;
+        }
         for (number, module) in view.modules.iter().enumerate() {
             let torque = module.torque != [0.0; AXES];
             if !module.plugged {
@@ -483,25 +507,12 @@ impl<'a> Rules<'a> {
                     format!("the weights of module {number} sum to {:.4}", sum as f64 / 32767.0),
                 );
             }
-            for gone in self.faults.iter().filter(|f| matches!(f.fault, Fault::Unplug(_)) && f.active(now)) {
-                let Fault::Unplug(hit) = gone.fault else { continue };
-                // Frames may be late, and then a cycle too.
-                let late = self.line.iter().any(|f| matches!(f.fault, Fault::Delay(_) | Fault::Duplicate(_)));
-                if !late
-                    && now >= gone.at_ns + (SEEN + 1) * self.period_ns
-                    && hit != number
-                    && module.heard & 1 << hit != 0
-                {
-                    self.broke(
-                        "dead_masked",
-                        now,
-                        format!(
-                            "module {number} attends to module {hit}, gone since {:.3} s",
-                            gone.at_ns as f64 * 1e-9
-                        ),
-                    );
-                }
+            if self.lossless {
+                self.gone(view, number);
             }
+        }
+        if self.line.is_empty() {
+            self.stop_holds(view);
         }
         self.stopped = stopped;
         if !self.quiet_for(now, SETTLED) {
@@ -515,6 +526,69 @@ impl<'a> Rules<'a> {
             if view.cuts & 1 << number != 0 || number + 1 == view.modules.len() {
                 self.piece(view, &std::mem::take(&mut piece));
             }
+        }
+    }
+
+    /// The rules about what a module makes of those that are gone.
+    fn gone(&mut self, view: &CycleView, number: usize) {
+        let module = &view.modules[number];
+        for (index, gone) in self.line.iter().enumerate() {
+            let (Fault::Unplug(hit) | Fault::BrownOut(hit)) = gone.fault else { continue };
+            if hit == number || !gone.active(view.at_ns) {
+                continue;
+            }
+            let cycles = u64::from(view.cycle).saturating_sub(gone.at_ns / self.period_ns);
+            let since = gone.at_ns as f64 * 1e-9;
+            // Without its time-keeper a piece of cable has no cycles for a while, and nobody acts anew.
+            let acted = self.in_step[number].1;
+            if cycles >= 2 && acted >= 2 && module.heard & 1 << hit != 0 {
+                return self.broke(
+                    "dead_masked",
+                    view.at_ns,
+                    format!("module {number} attends to module {hit}, gone since {since:.3} s"),
+                );
+            }
+            // A module that has only just started counts from then on.
+            let alone = self.line.iter().enumerate().all(|(other, fault)| {
+                let long_ago = |at: u64| at > view.at_ns || at + SETTLED * self.period_ns < gone.at_ns;
+                other == index || long_ago(fault.at_ns) && fault.until_ns.is_none_or(long_ago)
+            });
+            if cycles >= SEEN && alone && u64::from(acted) > SEEN && view.cuts == 0 && module.alive & 1 << hit != 0 {
+                return self.broke(
+                    "dead_seen",
+                    view.at_ns,
+                    format!("module {number} believes module {hit} alive, gone since {since:.3} s"),
+                );
+            }
+        }
+    }
+
+    /// The station's stop, heard by all.
+    fn stop_holds(&mut self, view: &CycleView) {
+        let last = self.orders.iter().rev().find(|(at, _)| *at <= view.at_ns);
+        let Some((at, StopCommand::Stop)) = last else { return };
+        if view.at_ns < at + self.period_ns {
+            return;
+        }
+        for (number, module) in view.modules.iter().enumerate() {
+            if module.torque != [0.0; AXES] || !module.faults.contains(ModuleFault::EmergencyStop) {
+                let what =
+                    format!("module {number} applies {:?}, stopped at {:.3} s", module.torque, *at as f64 * 1e-9);
+                return self.broke("stop_holds", view.at_ns, what);
+            }
+        }
+    }
+
+    /// When it is over.
+    fn end(&mut self, report: &sil::SilReport) {
+        let takeovers: u32 = report.modules.iter().map(|module| module.stats.takeovers).sum();
+        let most = 1 + TAKEOVERS * self.line.len() as u32;
+        if self.lossless && takeovers > most {
+            self.broke(
+                "takeovers",
+                report.duration_ns,
+                format!("the time was taken over {takeovers} times; {most} would do"),
+            );
         }
     }
 
