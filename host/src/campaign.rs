@@ -396,7 +396,7 @@ impl Plant for Watched {
         let was = self.torque[module];
         for axis in 0..AXES {
             let new = torque[axis];
-            if !(new.abs() <= self.limit * 1.000_001) {
+            if new.is_nan() || new.abs() > self.limit * 1.000_001 {
                 self.broke("torque_limit", format!("module {module} applied {new}"));
             }
             // What the plant sees moves by whole steps.

@@ -295,7 +295,7 @@ impl Scenario {
             bail!("episodes = 0 tests nothing: at least 1 is possible");
         }
         if let Some(clock) =
-            scenario.clock.iter().find(|clock| clock.module >= MAX_MODULES || !(clock.ppm.abs() <= 1e5))
+            scenario.clock.iter().find(|clock| clock.module >= MAX_MODULES || !(-1e5..=1e5).contains(&clock.ppm))
         {
             bail!(
                 "clock: module {} and {} ppm cannot be: up to 100000 ppm of a module from 0 to {}",
@@ -521,8 +521,8 @@ impl<'a> Watch<'a> {
         let now = view.at_ns;
         let plugged = || view.modules.iter().enumerate().filter(|(_, module)| module.plugged);
         for (number, module) in plugged() {
-            let largest = module.torque.iter().fold(0.0f32, |most, t| most.max(t.abs()));
-            if !(largest <= self.torque_limit * 1.000_001) {
+            let most = self.torque_limit * 1.000_001;
+            if let Some(largest) = module.torque.into_iter().find(|torque| !(-most..=most).contains(torque)) {
                 self.broke("torque_limit", format!("module {number} applied {largest} at {}", seconds(now)));
             }
         }

@@ -109,7 +109,7 @@ impl Variation {
     pub fn check(&self, config: &EnvConfig) -> Result<(), String> {
         for (name, range, [least, most]) in self.ranges() {
             let Some([low, high]) = range else { continue };
-            if !(low <= high) {
+            if low.is_nan() || high.is_nan() || low > high {
                 return Err(format!("{name} = [{low}, {high}] is upside down: write the smaller number first"));
             }
             if !(low >= least && high <= most) {

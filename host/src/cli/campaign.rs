@@ -227,7 +227,7 @@ fn read(path: &Path, heading: &Heading) -> Result<Option<Vec<Line>>> {
         match serde_json::from_str(line) {
             Ok(line) => lines.push(line),
             Err(_) if !line.ends_with('\n') => {
-                write_whole(path, text[..text.len() - line.len()].as_bytes())?;
+                write_whole(path, &text.as_bytes()[..text.len() - line.len()])?;
             }
             Err(error) => bail!("line {} of {} is damaged: {error}", number + 2, path.display()),
         }

@@ -19,11 +19,14 @@ use crate::eval::{PUBLISHED_SEED, Trial, parallel};
 use crate::files::{create_folder, write_whole};
 use crate::plot::{Heatmap, MapWords, heatmaps};
 
+/// Makes the fault of a module.
+type Kind = fn(Target) -> FaultKind;
+
 /// What can be broken about a module, from the start of the episode on.
-const KINDS: [(&str, fn(Target) -> FaultKind); 3] = [
-    ("unplugged", FaultKind::Unplug as fn(Target) -> FaultKind),
-    ("motors dead", FaultKind::Action as fn(Target) -> FaultKind),
-    ("sensors blind", FaultKind::Observation as fn(Target) -> FaultKind),
+const KINDS: [(&str, Kind); 3] = [
+    ("unplugged", FaultKind::Unplug as Kind),
+    ("motors dead", FaultKind::Action as Kind),
+    ("sensors blind", FaultKind::Observation as Kind),
 ];
 
 /// Arguments of `report faults`.
