@@ -36,9 +36,12 @@ type Stage = stage::Stage<SimplePwmChannel<'static, TIM1>, Output<'static>, Outp
 
 type Shared<T> = Mutex<CriticalSectionRawMutex, T>;
 
+/// The currents' converter and the power stage that they act on.
+type Sensed = (InjectedAdc<'static, ADC1, 3>, Stage);
+
 static COMMAND: Shared<Cell<Command>> = Mutex::new(Cell::new(Command { torque: None, rearm: [false; AXES] }));
 static MEASURED: Shared<Cell<Measured>> = Mutex::new(Cell::new(Measured::NOTHING));
-static STAGE: Shared<RefCell<Option<(InjectedAdc<'static, ADC1, 3>, Stage)>>> = Mutex::new(RefCell::new(None));
+static STAGE: Shared<RefCell<Option<Sensed>>> = Mutex::new(RefCell::new(None));
 
 /// The pins of both bridges, yaw and pitch.
 pub struct Bridges {
