@@ -104,6 +104,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     for module in [0, 3, 7, 63] {
         part(&format!("kinematics, the head seen from module {module}"), &format!("kinematics/{module}"))?;
     }
+    part("attitude filter, one update", "attitude")?;
     part("observation", "observation")?;
     part("encode", "encode")?;
     for modules in [8, 16, 32, 64] {
@@ -114,6 +115,9 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         part(&format!("framing, {title} built"), &format!("emit/{name}"))?;
         part(&format!("framing, {title} parsed"), &format!("parse/{name}"))?;
     }
+
+    part("service, a frame when nothing is asked", "service/idle")?;
+    part("service, a register read and answered", "service/read")?;
 
     println!("\n{:<44} {:>8} {:>10}", "fully connected int8, 64 x 64, requantised", "", "MAC/insn");
     let (dsp, portable) = (count("dense64/dsp")?, count("dense64/portable")?);
