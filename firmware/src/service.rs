@@ -436,6 +436,7 @@ impl Service {
             Operation::Store => {
                 disarmed?;
                 self.free()?;
+                at_rest(controller)?;
                 if let Err(error) = self.page.check() {
                     self.answer(request.answer(ServiceCode::OutOfRange, u32::from(culprit(&error))));
                     return Ok(None);
@@ -446,6 +447,7 @@ impl Service {
             Operation::SetNode => self.set_node(now, request, controller, board),
             Operation::Jog => {
                 disarmed?;
+                self.free()?;
                 self.jog(index, value, controller).map(Some)
             }
             Operation::Identify => {
@@ -521,6 +523,7 @@ impl Service {
                     return Err(ServiceCode::WrongModule);
                 }
                 self.free()?;
+                at_rest(controller)?;
                 let node = Register::Node.spec().first;
                 self.write(node, value, controller)?;
                 self.selected = 0;
@@ -818,6 +821,11 @@ fn set(page: &mut NodePage, register: Register, offset: u8, value: u32) {
     if let Some(place) = place {
         *place = float;
     }
+}
+
+/// Nothing is written to the flash while a motor jogs.
+fn at_rest(controller: &Controller<'_>) -> Result<(), ServiceCode> {
+    if controller.mode() == Mode::Service { Err(ServiceCode::Busy) } else { Ok(()) }
 }
 
 #[cfg(test)]

@@ -402,6 +402,28 @@ fn while_a_page_is_stored_it_does_not_change() {
 }
 
 #[test]
+fn no_page_is_stored_during_a_jog_and_no_jog_begun_during_a_store() {
+    let image = image();
+    let mut module = Module::new(&image);
+    module.run(500 * MS);
+    assert!(module.ask(Operation::Jog, 0, jog(300, 100)).is_ok());
+    assert_eq!(module.ask(Operation::Store, 0, 0), Err(ServiceCode::Busy));
+    module.run(200 * MS);
+    let request = |operation: Operation, value| ServiceRequest {
+        destination: NODE,
+        operation: operation as u8,
+        sequence: module.sequence,
+        index: 0,
+        value,
+    };
+    let (store, begun) = (request(Operation::Store, 0), request(Operation::Jog, jog(300, 100)));
+    assert_eq!(module.send(store), []);
+    assert_eq!(module.send(begun), [begun.answer(ServiceCode::Busy, 0)]);
+    assert_eq!(module.run(20 * MS), [store.answer(ServiceCode::Ok, 0)]);
+    assert!(module.ask(Operation::Jog, 0, jog(300, 100)).is_ok());
+}
+
+#[test]
 fn a_page_that_does_not_fit_together_is_refused_by_the_register() {
     let image = image();
     let bad = |register: Register, value: f32| (register, register.spec().first, value.to_bits());
