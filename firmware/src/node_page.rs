@@ -443,15 +443,7 @@ pub(crate) mod tests {
     use std::vec::Vec;
 
     pub fn page() -> NodePage {
-        let motor = MotorCalibration {
-            torque_constant: 80.0,
-            current_limit: 1.2,
-            cut_off: 2.5,
-            resistance: 4.0,
-            inductance: 1e-3,
-            sense_range: 6.6,
-            sense_zero: 0.5,
-        };
+        let [motor, _] = Calibration::NOMINAL.motors;
         let mut joints = [JointCalibration { zero: 0, reversed: false }; MAX_JOINTS];
         joints[2] = JointCalibration { zero: 0x1234, reversed: true };
         NodePage {

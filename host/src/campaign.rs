@@ -449,11 +449,10 @@ impl<'a> Rules<'a> {
         let disturbs = |fault: &&ScheduledFault| {
             !matches!(fault.fault, Fault::ActuatorDead(_) | Fault::SensorZeroed(_) | Fault::SensorStuck(_))
         };
-        let plain =
-            |fault: &ScheduledFault| matches!(fault.fault, Fault::Unplug(_) | Fault::BrownOut(_) | Fault::Cut(_));
         let line: Vec<ScheduledFault> = sil.faults.iter().filter(disturbs).copied().collect();
         Rules {
-            lossless: line.iter().all(plain) && sil.clocks.iter().all(|clock| clock.drift_ppb == 0),
+            lossless: line.iter().all(|scheduled| scheduled.fault.changes_line())
+                && sil.clocks.iter().all(|clock| clock.drift_ppb == 0),
             orders: &sil.commands,
             period_ns: (f64::from(config.control_period) * 1e9).round() as u64,
             line,
@@ -469,11 +468,10 @@ impl<'a> Rules<'a> {
 
     /// Whether the line has had so many cycles to settle, and nothing disturbs it.
     fn quiet_for(&self, now: u64, cycles: u64) -> bool {
-        let lasting = |fault: &Fault| matches!(fault, Fault::Unplug(_) | Fault::BrownOut(_) | Fault::Cut(_));
         self.line.iter().all(|scheduled| {
             let over = |at: u64| now < at || now >= at + cycles * self.period_ns;
             // A module that is gone or a cable that is cut stays so without disturbing anybody.
-            let disturbing = scheduled.active(now) && !lasting(&scheduled.fault);
+            let disturbing = scheduled.active(now) && !scheduled.fault.changes_line();
             !disturbing && over(scheduled.at_ns) && scheduled.until_ns.is_none_or(over)
         })
     }
@@ -518,14 +516,8 @@ impl<'a> Rules<'a> {
         if !self.quiet_for(now, SETTLED) {
             return;
         }
-        let mut piece: Vec<usize> = Vec::new();
-        for number in 0..view.modules.len() {
-            if view.modules[number].plugged {
-                piece.push(number);
-            }
-            if view.cuts & 1 << number != 0 || number + 1 == view.modules.len() {
-                self.piece(view, &std::mem::take(&mut piece));
-            }
+        for piece in view.pieces() {
+            self.piece(view, &piece);
         }
     }
 

@@ -582,7 +582,7 @@ impl<'a> Watch<'a> {
             }
         }
         if let Some(cycles) = expect.one_time_keeper_within {
-            let line = self.faults.iter().filter(|f| matches!(f.fault, Fault::Unplug(_) | Fault::Cut(_)));
+            let line = self.faults.iter().filter(|f| f.fault.changes_line());
             let changed =
                 line.flat_map(|f| [Some(f.at_ns), f.until_ns]).flatten().filter(|at| *at <= now).max().unwrap_or(0);
             if now >= changed + u64::from(cycles) * self.period_ns {
@@ -625,24 +625,15 @@ fn seconds(ns: u64) -> String {
 
 /// Two modules of one piece of cable that follow different time-keepers, in words.
 fn several_time_keepers(view: &CycleView) -> Option<String> {
-    let mut first: Option<(usize, u8)> = None;
-    for (number, module) in view.modules.iter().enumerate() {
-        if module.plugged
-            && module.mode != Mode::Boot
-            && let Some(keeper) = module.time_keeper
-        {
-            match first {
-                Some((other, its)) if its != keeper => {
-                    return Some(format!("module {other} follows {its} and module {number} follows {keeper}"));
-                }
-                _ => first = Some((number, keeper)),
-            }
-        }
-        if view.cuts & 1 << number != 0 {
-            first = None;
-        }
-    }
-    None
+    view.pieces().into_iter().find_map(|piece| {
+        let mut followers = piece.into_iter().filter_map(|number| {
+            let module = &view.modules[number];
+            Some((number, module.time_keeper.filter(|_| module.mode != Mode::Boot)?))
+        });
+        let (first, its) = followers.next()?;
+        let (other, keeper) = followers.find(|(_, keeper)| *keeper != its)?;
+        Some(format!("module {first} follows {its} and module {other} follows {keeper}"))
+    })
 }
 
 #[cfg(test)]

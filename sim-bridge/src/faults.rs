@@ -326,6 +326,11 @@ pub enum Fault {
 }
 
 impl Fault {
+    /// Whether it changes which modules there are, or which of them hear each other.
+    pub fn changes_line(&self) -> bool {
+        matches!(self, Fault::Unplug(_) | Fault::BrownOut(_) | Fault::Cut(_))
+    }
+
     /// The module that it happens to, if it is one.
     pub fn module(&self) -> Option<usize> {
         match *self {

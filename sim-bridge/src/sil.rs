@@ -280,6 +280,22 @@ pub struct CycleView<'a> {
     pub cuts: u64,
 }
 
+impl CycleView<'_> {
+    /// The modules that are plugged in, by the pieces of cable that they hang on, head first.
+    pub fn pieces(&self) -> Vec<Vec<usize>> {
+        let mut pieces = vec![Vec::new()];
+        for (number, module) in self.modules.iter().enumerate() {
+            if let Some(piece) = pieces.last_mut().filter(|_| module.plugged) {
+                piece.push(number);
+            }
+            if self.cuts & 1 << number != 0 {
+                pieces.push(Vec::new());
+            }
+        }
+        pieces
+    }
+}
+
 /// What became of one module.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ModuleReport {

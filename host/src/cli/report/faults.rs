@@ -2,20 +2,17 @@
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
 use composer_shared::policies;
-use composer_shared::policy::{Policy, Task};
+use composer_shared::policy::Task;
 use composer_sim_bridge::faults::{FaultKind, FaultPlan, PlannedFault, Target};
 use serde_json::{Value, json};
 
-use super::policies::world;
-use super::rows::Rows;
+use super::rows::{Rows, measured};
 use crate::cli::export::Measured;
 use crate::cli::{PolicySource, task_by_name};
-use crate::env::EnvConfig;
-use crate::eval::{PUBLISHED_SEED, Trial, parallel};
+use crate::eval::parallel;
 use crate::files::{create_folder, write_whole};
 use crate::plot::{Heatmap, MapWords, heatmaps};
 
@@ -93,14 +90,17 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         let cells = cells(config.robot.modules);
         let threads = arguments.threads.unwrap_or_else(crate::cli::cores);
         // A cell is small: one thread each.
-        let measured = parallel(cells.len(), threads, |number| {
+        let found = parallel(cells.len(), threads, |number| {
             if number % 12 == 0 {
                 eprintln!("{name}: {number} of {}", cells.len());
             }
-            measure(&kept, &source, &config, &cells[number], arguments)
+            let (cell, plan) = (&cells[number], cells[number].plan());
+            let alone = cell.modules[0] == cell.modules[1];
+            let episodes = if alone { arguments.episodes } else { arguments.pair_episodes };
+            measured(&kept, &source, &config, &plan, &plan, (episodes, 1))
         });
-        let measured = measured.into_iter().collect::<Result<Vec<_>>>()?;
-        let maps = maps(config.robot.modules, &cells, &measured);
+        let found = found.into_iter().collect::<Result<Vec<_>>>()?;
+        let maps = maps(config.robot.modules, &cells, &found);
         let words = MapWords {
             title: format!("{}: success with broken modules", task.title()),
             columns: "module".into(),
@@ -108,39 +108,12 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             largest: Some(1.0),
         };
         write_whole(&arguments.out.join(format!("{name}.svg")), heatmaps(&maps, &words).as_bytes())?;
-        rows(&mut table, task, config.robot.modules, &cells, &measured)?;
-        data.extend(cells.iter().zip(&measured).map(|(cell, measured)| -> Value {
+        rows(&mut table, task, config.robot.modules, &cells, &found)?;
+        data.extend(cells.iter().zip(&found).map(|(cell, measured)| -> Value {
             json!({"policy": name, "kind": KINDS[cell.kind].0, "modules": cell.modules, "measured": measured})
         }));
     }
     publish(&table, &data, arguments)
-}
-
-/// One cell, unless it is there already.
-fn measure(
-    kept: &Rows,
-    source: &PolicySource,
-    config: &EnvConfig,
-    cell: &Cell,
-    arguments: &Arguments,
-) -> Result<Measured> {
-    let image = source.image().context("what ships is an image")?;
-    let crc = Policy::parse(image).map_err(|e| anyhow::anyhow!("{e}"))?.crc();
-    let [a, b] = cell.modules;
-    let episodes = if a == b { arguments.episodes } else { arguments.pair_episodes };
-    let plan = cell.plan();
-    let key = format!("{} {crc:08x} {plan} episodes={episodes} world={:08x}", config.task.task(), world(config));
-    kept.get(&key, || {
-        let draw = |seed, modules| plan.draw(seed, modules);
-        let trial = Trial {
-            config: &Arc::new(config.clone()),
-            episodes: episodes as usize,
-            seed: PUBLISHED_SEED,
-            faults: &draw,
-            threads: 1,
-        };
-        Ok(trial.evaluate(&*source.policy()?, &plan.to_string(), &|| {}).into())
-    })
 }
 
 /// A matrix for each kind: single modules on the diagonal, pairs on either side of it.

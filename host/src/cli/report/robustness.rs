@@ -2,20 +2,17 @@
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Result, bail};
 use composer_shared::policies;
-use composer_shared::policy::{Policy, Task};
+use composer_shared::policy::Task;
+use composer_sim_bridge::faults::FaultPlan;
 use serde_json::{Value, json};
 
-use super::policies::world;
-use super::rows::Rows;
+use super::rows::{Rows, measured};
 use crate::cli::export::Measured;
 use crate::cli::physics::Physics;
 use crate::cli::{PolicySource, task_by_name};
-use crate::env::EnvConfig;
-use crate::eval::{PUBLISHED_SEED, Trial, healthy};
 use crate::files::{create_folder, write_whole};
 use crate::robot::Robot;
 use crate::robot::Solver;
@@ -89,40 +86,14 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         let mut cells = Vec::new();
         for (name, source, config) in &shipped {
             eprintln!("{words}: {name}");
-            cells.push(measured(&rows, source, &physics.apply(config.clone())?, &physics, arguments)?);
+            let size = (arguments.episodes, arguments.threads.unwrap_or_else(crate::cli::cores));
+            let config = physics.apply(config.clone())?;
+            cells.push(measured(&rows, source, &config, &physics, &FaultPlan::default(), size)?);
         }
         results.push((words, physics, cells));
     }
     let names: Vec<&str> = shipped.iter().map(|(name, ..)| *name).collect();
     publish(&names, &results, &left_out, &arguments.out)
-}
-
-/// One cell, unless it is there already.
-fn measured(
-    rows: &Rows,
-    source: &PolicySource,
-    config: &EnvConfig,
-    physics: &Physics,
-    arguments: &Arguments,
-) -> Result<Measured> {
-    let image = source.image().context("what ships is an image")?;
-    let crc = Policy::parse(image).map_err(|e| anyhow::anyhow!("{e}"))?.crc();
-    let key = format!(
-        "{} {crc:08x} {physics} episodes={} world={:08x}",
-        config.task.task(),
-        arguments.episodes,
-        world(config)
-    );
-    rows.get(&key, || {
-        let trial = Trial {
-            config: &Arc::new(config.clone()),
-            episodes: arguments.episodes as usize,
-            seed: PUBLISHED_SEED,
-            faults: &healthy,
-            threads: arguments.threads.unwrap_or_else(crate::cli::cores),
-        };
-        Ok(trial.evaluate(&*source.policy()?, "none", &|| {}).into())
-    })
 }
 
 /// The table and the data.

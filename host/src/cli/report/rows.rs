@@ -2,13 +2,20 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use anyhow::{Context, Result};
+use composer_shared::policy::Policy;
+use composer_sim_bridge::faults::FaultPlan;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 
+use super::policies::world;
+use crate::cli::PolicySource;
+use crate::cli::export::Measured;
+use crate::env::EnvConfig;
+use crate::eval::{PUBLISHED_SEED, Trial};
 use crate::files::write_whole;
 
 /// Results by what they are results of.
@@ -40,6 +47,31 @@ impl Rows {
         write_whole(&self.path, serde_json::to_string_pretty(&*rows)?.as_bytes())?;
         Ok(result)
     }
+}
+
+/// The first `episodes` published episodes of a policy that ships, unless they are there already; `words` say what is special about them.
+pub fn measured(
+    rows: &Rows,
+    source: &PolicySource,
+    config: &EnvConfig,
+    words: &dyn std::fmt::Display,
+    plan: &FaultPlan,
+    (episodes, threads): (u64, usize),
+) -> Result<Measured> {
+    let image = source.image().context("what ships is an image")?;
+    let crc = Policy::parse(image).map_err(|e| anyhow::anyhow!("{e}"))?.crc();
+    let key = format!("{} {crc:08x} {words} episodes={episodes} world={:08x}", config.task.task(), world(config));
+    rows.get(&key, || {
+        let draw = |seed, modules| plan.draw(seed, modules);
+        let trial = Trial {
+            config: &Arc::new(config.clone()),
+            episodes: episodes as usize,
+            seed: PUBLISHED_SEED,
+            faults: &draw,
+            threads,
+        };
+        Ok(trial.evaluate(&*source.policy()?, &plan.to_string(), &|| {}).into())
+    })
 }
 
 #[cfg(test)]
