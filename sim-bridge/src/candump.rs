@@ -67,6 +67,11 @@ pub fn write_entry(out: &mut dyn Write, at_ns: u64, interface: &str, frame: &Fra
     out.write_all(b"\n")
 }
 
+/// The interface that stands for a piece of cable, from the head end: `can0`, after a cut also `can1`.
+pub fn interface(piece: usize) -> String {
+    format!("can{piece}")
+}
+
 /// Reads one line; a trailing `R` or `T` (direction, as newer versions write) is ignored.
 pub fn parse_entry(line: &str) -> Result<Entry, CandumpError> {
     let mut parts = line.split_ascii_whitespace();

@@ -100,6 +100,14 @@ pub trait Launcher {
     fn start(&self, config: Config, boot: Boot, now: Micros) -> Result<Self::Computer, Trouble>;
 }
 
+impl<L: Launcher> Launcher for &L {
+    type Computer = L::Computer;
+
+    fn start(&self, config: Config, boot: Boot, now: Micros) -> Result<Self::Computer, Trouble> {
+        (**self).start(config, boot, now)
+    }
+}
+
 /// Modules in this process.
 #[derive(Clone, Debug)]
 pub struct InProcess<'a> {

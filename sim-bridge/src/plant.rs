@@ -22,6 +22,44 @@ pub trait Plant {
     fn step(&mut self);
     /// Whether the episode is over (success, or its time is up).
     fn done(&self) -> bool;
+    /// Moves the goal to a place (robot units, the world's frame), if the plant has one that can be moved.
+    fn move_goal(&mut self, _place: [f32; 3]) -> bool {
+        false
+    }
+}
+
+impl<P: Plant + ?Sized> Plant for &mut P {
+    fn modules(&self) -> usize {
+        (**self).modules()
+    }
+
+    fn step_ns(&self) -> u64 {
+        (**self).step_ns()
+    }
+
+    fn sensors(&self, module: usize) -> Sensors {
+        (**self).sensors(module)
+    }
+
+    fn point(&self, number: u8) -> Option<[f32; 3]> {
+        (**self).point(number)
+    }
+
+    fn set_torque(&mut self, module: usize, torque: [f32; AXES]) {
+        (**self).set_torque(module, torque);
+    }
+
+    fn step(&mut self) {
+        (**self).step();
+    }
+
+    fn done(&self) -> bool {
+        (**self).done()
+    }
+
+    fn move_goal(&mut self, place: [f32; 3]) -> bool {
+        (**self).move_goal(place)
+    }
 }
 
 /// A robot on the bench: straight, level, at room temperature, and nothing moves it.

@@ -21,338 +21,45 @@
 //! if there are frames to inject, a foreign node, then the nodes that somebody [`Outside`] plays. Without those everything follows from the plant, the policy image and the configuration: the same
 //! ones give the same run, bit for bit.
 
+mod change;
+mod config;
+mod outside;
+mod report;
+mod simulation;
+
 use std::collections::VecDeque;
 use std::io::{self, Write};
 
 use composer_firmware::budget::step_us;
 use composer_firmware::controller::{
-    Boot, BusKind, BusOffPolicy, BusStatus, Config, ConfigError, FaultSet, Micros, ResetCause, Retained, Stats, Timing,
+    Boot, BusKind, BusOffPolicy, BusStatus, Config, FaultSet, Micros, ResetCause, Retained, Stats, Timing,
 };
-use composer_firmware::port::{CanPort, Counts};
-use composer_firmware::safety::Safety;
+use composer_firmware::port::CanPort;
 use composer_shared::observation::Sensors;
-use composer_shared::policy::{Policy, PolicyError};
+use composer_shared::policy::Policy;
 use composer_shared::robot::{AXES, MAX_MODULES};
 use composer_shared::wire::{Frame, Function, Mode, StopCommand};
 
 use crate::bus::{self, Bus, BusConfig, Disturbance, Event};
 use crate::candump;
 use crate::computer::{Computer, InProcess, Launcher, Poll, Trouble};
-use crate::confinement::{ErrorCounters, ErrorState};
-use crate::faults::{Fault, ScheduledFault};
-use crate::frame_bits::BitRates;
+use crate::faults::Fault;
 use crate::plant::Plant;
 use crate::port::Port;
 use crate::station::Station;
+
+pub use change::{Change, Refusal};
+pub use config::{Clock, Injected, SilConfig, SilError};
+pub use outside::{Outside, Turn};
+pub use report::{CycleView, Lost, ModuleReport, ModuleView, SilReport};
+pub use simulation::{Simulation, Watch};
 
 const NEVER: u64 = u64::MAX;
 /// How long before time 0 the station arms the robot, us.
 const BEFORE_US: u64 = 1_000;
 
-/// A module's clock against true time.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Clock {
-    /// What it shows more than the others, us.
-    pub offset_us: u64,
-    /// How much faster it runs, parts per billion (1 ppm is 1000). Held within +-10 %.
-    pub drift_ppb: i32,
-}
-
-impl Clock {
-    fn drift(self) -> i128 {
-        i128::from(self.drift_ppb.clamp(-100_000_000, 100_000_000))
-    }
-
-    /// What it shows at true time `ns`, us.
-    fn show(self, ns: u64) -> Micros {
-        if self.drift_ppb == 0 {
-            return self.offset_us + ns / 1000;
-        }
-        let passed = i128::from(ns) + (i128::from(ns) * self.drift()).div_euclid(1_000_000_000);
-        self.offset_us + (passed / 1000) as u64
-    }
-
-    /// The first true time, ns, at which it shows `us` or more.
-    fn reaches(self, us: Micros) -> u64 {
-        let passed = us.saturating_sub(self.offset_us).saturating_mul(1000);
-        if self.drift_ppb == 0 {
-            return passed;
-        }
-        // Within a few ns of the true one, because both divisions round.
-        let rate = 1_000_000_000 + self.drift();
-        let mut ns = (i128::from(passed) * 1_000_000_000 / rate).min(i128::from(NEVER)) as u64;
-        while ns < NEVER && self.show(ns) < us {
-            ns += 1;
-        }
-        while ns > 0 && self.show(ns - 1) >= us {
-            ns -= 1;
-        }
-        ns
-    }
-}
-
-/// A frame that a foreign device sends.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Injected {
-    /// When, ns.
-    pub at_ns: u64,
-    /// What.
-    pub frame: Frame,
-}
-
-/// Somebody outside of the simulation who takes part in a run: nodes at the tail end of the cable, and how fast time goes.
-pub trait Outside {
-    /// How many nodes it plays.
-    fn nodes(&self) -> usize;
-
-    /// The simulation is at `now` and will go on at `next` (ns) if nobody sends anything before. This may take its time.
-    fn wait(&mut self, now: u64, next: u64) -> Turn;
-
-    /// Node `node` of those it plays, from 0, has received a frame that another node sent.
-    fn hear(&mut self, node: usize, frame: &Frame);
-}
-
-/// What somebody [`Outside`] does next.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Turn {
-    /// Nothing until then.
-    GoOn,
-    /// One of its nodes sends a frame.
-    Send {
-        /// Which node, from 0.
-        node: usize,
-        /// When, ns; held within the time that was asked for.
-        at_ns: u64,
-        /// What.
-        frame: Frame,
-    },
-    /// The run is to end.
-    End,
-}
-
 /// Frames that may wait for a mailbox of a node [`Outside`]; more are lost, as in an adapter.
 const OUTSIDE_QUEUE: usize = 1024;
-
-/// How a run is set up.
-#[derive(Clone, Debug, PartialEq)]
-pub struct SilConfig {
-    /// Kind of bus.
-    pub bus: BusKind,
-    /// Its bit rates.
-    pub rates: BitRates,
-    /// What goes wrong and when ([`crate::faults::FaultPlan::draw`]).
-    pub faults: Vec<ScheduledFault>,
-    /// Seed of everything random on the bus: losses, delays, corruption.
-    pub seed: u64,
-    /// From the last STATE needed (or the state deadline) until LATENT is ready to be sent, us. The default, 200, is well above what
-    /// a Cortex-M4 at 170 MHz needs for the observation and the encoder.
-    pub encode_latency_us: u32,
-    /// From the last LATENT needed (or the collection deadline) until the torque is at the motor, us. None, the default, takes what a whole control
-    /// step of that many modules may take on the Cortex-M4F ([`composer_firmware::budget::step_us`]): 662 for 8 modules, 2787 for 64.
-    pub act_latency_us: Option<u32>,
-    /// From hearing SYNC until GOAL is ready to be sent, us. Default 50.
-    pub station_latency_us: u32,
-    /// Clocks of the modules, head first; those not listed are exact.
-    pub clocks: Vec<Clock>,
-    /// Configured numbers of the modules, head first; those not listed have the right one.
-    pub numbers: Vec<u8>,
-    /// Whether there is a station. Without one nobody tells the robot anything, unless somebody [`Outside`] does.
-    pub station: bool,
-    /// Number of modules between the head end of the cable and the station: 0 puts it at the head end.
-    pub station_behind: usize,
-    /// Stops and releases that the station sends, with their times in ns.
-    pub commands: Vec<(u64, StopCommand)>,
-    /// Frames of a foreign device at the tail end of the cable, in order of time.
-    pub injected: Vec<Injected>,
-    /// What controllers do after bus-off.
-    pub bus_off: BusOffPolicy,
-    /// What modules keep to whatever their policy wants. By default as on a board without limits of its own, but a module whose sensors read nothing goes
-    /// on with an observation of zeros, as in the paper.
-    pub safety: Safety,
-    /// Timing of the control cycle; none takes the default for policy, bus and number of modules.
-    pub timing: Option<Timing>,
-    /// The run ends here even if the plant is not done, ns. Default 10 minutes.
-    pub limit_ns: u64,
-}
-
-impl SilConfig {
-    /// A healthy robot on a bus of this kind: 1 Mbit/s, with 5 Mbit/s in the data phase of FD.
-    pub fn new(bus: BusKind) -> Self {
-        SilConfig {
-            bus,
-            rates: if bus == BusKind::Fd { BitRates::FD_1M_5M } else { BitRates::CLASSIC_1M },
-            faults: Vec::new(),
-            seed: 0,
-            encode_latency_us: 200,
-            act_latency_us: None,
-            station_latency_us: 50,
-            clocks: Vec::new(),
-            numbers: Vec::new(),
-            station: true,
-            station_behind: 0,
-            commands: Vec::new(),
-            injected: Vec::new(),
-            bus_off: BusOffPolicy::Recover,
-            safety: Safety { blind_relaxes: false, ..Safety::POLICY },
-            timing: None,
-            limit_ns: 600_000_000_000,
-        }
-    }
-
-    fn clock(&self, module: usize) -> Clock {
-        self.clocks.get(module).copied().unwrap_or_default()
-    }
-}
-
-/// Why a run cannot be made.
-#[derive(Debug, thiserror::Error)]
-pub enum SilError {
-    /// The policy image is refused.
-    #[error("{0}")]
-    Policy(PolicyError),
-    /// A controller refuses its configuration.
-    #[error("{0}")]
-    Config(ConfigError),
-    /// The plant has no modules, or more than fit on a bus.
-    #[error("{0} modules cannot be simulated: a robot has 1 to {MAX_MODULES}")]
-    Modules(usize),
-    /// The bit rates make no sense.
-    #[error(
-        "bit rates of {nominal} and {data} bit/s cannot be: the nominal rate is 10000 to 1000000, the data rate at least as much and at most 8000000"
-    )]
-    Rates {
-        /// Nominal bit rate, bit/s.
-        nominal: u32,
-        /// Data bit rate, bit/s.
-        data: u32,
-    },
-    /// The plant's step is zero.
-    #[error("the plant's step is 0 ns, but must be at least 1")]
-    Step,
-    /// The computer of a module failed.
-    #[error("module {module}: {error}")]
-    Computer {
-        /// Which module.
-        module: usize,
-        /// Why.
-        error: Trouble,
-    },
-    /// The capture cannot be written.
-    #[error("the capture cannot be written: {0}")]
-    Capture(#[from] io::Error),
-}
-
-/// One module at the end of a control cycle.
-#[derive(Clone, Copy, Debug)]
-pub struct ModuleView<'a> {
-    /// Whether it is plugged in. If not, all else is empty.
-    pub plugged: bool,
-    /// What it is at.
-    pub mode: Mode,
-    /// Number of its control cycle.
-    pub cycle: u16,
-    /// Whose SYNC it follows.
-    pub time_keeper: Option<u8>,
-    /// Modules that it believes alive, itself included, as a bit mask.
-    pub alive: u64,
-    /// Modules that it attended over in its last action, itself included, as a bit mask.
-    pub heard: u64,
-    /// Attention weights of its last action by module, Q15 (32767 is 1).
-    pub attention: &'a [u16; MAX_MODULES],
-    /// The torque that the plant applies (yaw, pitch).
-    pub torque: [f32; AXES],
-    /// Its active faults.
-    pub faults: FaultSet,
-    /// Its error state on the bus.
-    pub bus: ErrorState,
-}
-
-/// The robot at the end of a control cycle.
-#[derive(Clone, Debug)]
-pub struct CycleView<'a> {
-    /// Number of the cycle, from 0, by true time.
-    pub cycle: u32,
-    /// Its end, ns.
-    pub at_ns: u64,
-    /// The modules, head first.
-    pub modules: &'a [ModuleView<'a>],
-    /// Modules behind which the cable is cut, as a bit mask.
-    pub cuts: u64,
-}
-
-impl CycleView<'_> {
-    /// The modules that are plugged in, by the pieces of cable that they hang on, head first.
-    pub fn pieces(&self) -> Vec<Vec<usize>> {
-        let mut pieces = vec![Vec::new()];
-        for (number, module) in self.modules.iter().enumerate() {
-            if let Some(piece) = pieces.last_mut().filter(|_| module.plugged) {
-                piece.push(number);
-            }
-            if self.cuts & 1 << number != 0 {
-                pieces.push(Vec::new());
-            }
-        }
-        pieces
-    }
-}
-
-/// What became of one module.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct ModuleReport {
-    /// Its controller's counters, added up if it was plugged in again.
-    pub stats: Stats,
-    /// Its counters on the bus.
-    pub bus: bus::NodeStats,
-    /// Its error counters at the end.
-    pub errors: ErrorCounters,
-    /// What happened at its CAN port while it was plugged in last.
-    pub port: Counts,
-    /// Longest time between two actions while plugged in, ms. From its start to its first action counts too, and from its
-    /// last to the end.
-    pub longest_gap_ms: f64,
-}
-
-/// A module that was lost though no fault of the plan took it: somebody else ended its computer.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Lost {
-    /// Which module.
-    pub module: usize,
-    /// When it was noticed, ns.
-    pub at_ns: u64,
-    /// What happened.
-    pub how: String,
-}
-
-/// What a run was like.
-#[derive(Clone, Debug, PartialEq)]
-pub struct SilReport {
-    /// Length, ns of virtual time.
-    pub duration_ns: u64,
-    /// Control cycles that the module with the most of them started.
-    pub cycles: u32,
-    /// Share of the time in which the bus was busy, 0 to 1.
-    pub bus_load: f64,
-    /// Largest age of a latent when it was acted on, from the start of its cycle to the torque at the motor, ms.
-    pub latent_age_max_ms: f64,
-    /// Cycles in which a live neighbour's latent was missing when a module acted, over all modules.
-    pub deadline_misses: u64,
-    /// Frames sent successfully.
-    pub frames: u64,
-    /// Error frames.
-    pub error_frames: u64,
-    /// Frames lost at receivers.
-    pub dropped: u64,
-    /// Longest time from a frame being ready to its reception, ms.
-    pub frame_latency_max_ms: f64,
-    /// The faults that occurred.
-    pub faults: Vec<ScheduledFault>,
-    /// Modules that somebody else took away; never any in the own process.
-    pub lost: Vec<Lost>,
-    /// Whether the run ended by [`SilConfig::limit_ns`] instead of the plant being done.
-    pub cut_short: bool,
-    /// The modules, head first.
-    pub modules: Vec<ModuleReport>,
-}
 
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 enum SensorState {
@@ -415,9 +122,9 @@ fn timing_of(config: &SilConfig, policy: &Policy<'_>, modules: usize) -> Timing 
 }
 
 struct Engine<'c, L: Launcher> {
-    config: &'c SilConfig,
+    config: SilConfig,
     policy: Policy<'c>,
-    launcher: &'c L,
+    launcher: L,
     bus: Bus,
     station: Station,
     /// GOAL frames of this cycle that wait for room in the station's CAN port.
@@ -474,77 +181,51 @@ pub fn run_with<P: Plant + ?Sized, L: Launcher>(
     plant: &mut P,
     policy: Policy<'_>,
     config: &SilConfig,
-    mut outside: Option<&mut dyn Outside>,
-    mut capture: Option<&mut dyn Write>,
+    outside: Option<&mut dyn Outside>,
+    capture: Option<&mut dyn Write>,
     observer: &mut dyn FnMut(&CycleView<'_>, &P),
 ) -> Result<SilReport, SilError> {
-    let count = plant.modules();
-    if count == 0 || count > MAX_MODULES {
-        return Err(SilError::Modules(count));
-    }
-    let BitRates { nominal, data } = config.rates;
-    if !(10_000..=1_000_000).contains(&nominal) || !(nominal..=8_000_000).contains(&data) {
-        return Err(SilError::Rates { nominal, data });
-    }
-    let step_ns = plant.step_ns();
-    if step_ns == 0 {
-        return Err(SilError::Step);
-    }
-    let mut engine =
-        Engine::new(config, launcher, policy, count, outside.as_ref().map_or(0, |outside| outside.nodes()))?;
-    let period_ns = u64::from(engine.timing().period_us) * 1000;
-    let (mut next_step, mut next_view, mut cycle) = (step_ns, period_ns, 0);
-    let mut now = 0;
-    while !plant.done() && now < config.limit_ns {
-        let mut next = engine.next_ns().min(next_step).min(config.limit_ns);
-        if let Some(outside) = &mut outside {
-            match outside.wait(now, next) {
-                Turn::GoOn => {}
-                Turn::Send { node, at_ns, frame } => {
-                    next = at_ns.clamp(now, next);
-                    engine.enqueue_outside(node, frame);
-                }
-                Turn::End => break,
-            }
+    let mut watch = Observed { capture, observer };
+    run_watched(launcher, plant, policy, config, outside, &mut watch)
+}
+
+/// The same with somebody who looks at more than the ends of the cycles.
+pub fn run_watched<P: Plant + ?Sized, L: Launcher>(
+    launcher: &L,
+    plant: &mut P,
+    policy: Policy<'_>,
+    config: &SilConfig,
+    outside: Option<&mut dyn Outside>,
+    watch: &mut dyn Watch<P>,
+) -> Result<SilReport, SilError> {
+    let nodes = outside.as_ref().map_or(0, |outside| outside.nodes());
+    let mut simulation = Simulation::with_nodes(launcher, plant, policy, config.clone(), nodes)?;
+    simulation.run(outside, watch)?;
+    simulation.report()
+}
+
+/// A candump log, and somebody who looks at every cycle.
+struct Observed<'a, 'b, P: ?Sized> {
+    capture: Option<&'a mut dyn Write>,
+    observer: &'b mut dyn FnMut(&CycleView<'_>, &P),
+}
+
+impl<P: ?Sized> Watch<P> for Observed<'_, '_, P> {
+    fn frame(&mut self, at_ns: u64, piece: usize, frame: &Frame) -> io::Result<()> {
+        match &mut self.capture {
+            Some(out) => candump::write_entry(*out, at_ns, &candump::interface(piece), frame),
+            None => Ok(()),
         }
-        now = next;
-        engine.change_faults(plant, now)?;
-        if next_step <= now {
-            plant.step();
-            engine.apply_torques(plant, now);
-            next_step += step_ns;
-            if now >= next_view || plant.done() {
-                engine.view(cycle, now, plant, observer)?;
-                cycle += 1;
-                next_view += period_ns;
-                if plant.done() {
-                    break;
-                }
-            }
-        }
-        engine.send_scripted(now);
-        engine.send_outside(now);
-        engine.poll_ports(now);
-        while let Some(event) = engine.bus.poll(now) {
-            if let (Some(outside), Event::Delivered { frame, receivers, .. }) = (&mut outside, &event) {
-                let first = engine.outside_node;
-                bus::nodes(*receivers).filter(|node| *node >= first).for_each(|node| outside.hear(node - first, frame));
-            }
-            engine.handle(plant, &event, &mut capture)?;
-        }
-        engine.poll_due(plant, now)?;
     }
-    engine.report(now, !plant.done())
+
+    fn cycle(&mut self, view: &CycleView<'_>, plant: &P) -> io::Result<()> {
+        (self.observer)(view, plant);
+        Ok(())
+    }
 }
 
 impl<'c, L: Launcher> Engine<'c, L> {
-    fn new(
-        config: &'c SilConfig,
-        launcher: &'c L,
-        policy: Policy<'c>,
-        count: usize,
-        outside: usize,
-    ) -> Result<Self, SilError> {
+    fn new(config: SilConfig, launcher: L, policy: Policy<'c>, count: usize, outside: usize) -> Result<Self, SilError> {
         let outside_node = count + 1 + usize::from(!config.injected.is_empty());
         let nodes = outside_node + outside;
         let bus_config = BusConfig { rates: config.rates, automatic_recovery: config.bus_off == BusOffPolicy::Recover };
@@ -554,9 +235,9 @@ impl<'c, L: Launcher> Engine<'c, L> {
             changes.extend(scheduled.until_ns.map(|until| (until, false, scheduled.fault)));
         }
         changes.sort_by_key(|change| change.0);
-        let period = u64::from(timing_of(config, &policy, count).period_us);
+        let period = u64::from(timing_of(&config, &policy, count).period_us);
+        let act_latency_us = config.act_latency_us.map_or(step_us(count as u8), u64::from);
         let mut engine = Engine {
-            config,
             policy,
             launcher,
             bus: Bus::new(bus_config, nodes, config.seed),
@@ -574,9 +255,10 @@ impl<'c, L: Launcher> Engine<'c, L> {
             outside_node,
             outside_waiting: VecDeque::new(),
             next_poll_ns: 0,
-            act_latency_ns: 1000 * config.act_latency_us.map_or(step_us(count as u8), u64::from),
+            act_latency_ns: 1000 * act_latency_us,
+            config,
         };
-        if !config.station {
+        if !engine.config.station {
             engine.bus.unplug(0, engine.station_node);
         }
         for module in 0..count {
@@ -584,7 +266,7 @@ impl<'c, L: Launcher> Engine<'c, L> {
                 controller: None,
                 lost: false,
                 kept: None,
-                clock: config.clock(module),
+                clock: engine.config.clock(module),
                 port: Port::new(period),
                 next_poll_ns: 0,
                 busy_until_ns: 0,
@@ -613,7 +295,7 @@ impl<'c, L: Launcher> Engine<'c, L> {
             let controller = engine.start(module, Boot::default(), started)?;
             engine.modules[module].controller = Some(controller);
         }
-        if config.station {
+        if engine.config.station {
             engine.arm_before_the_start()?;
         }
         Ok(engine)
@@ -641,7 +323,7 @@ impl<'c, L: Launcher> Engine<'c, L> {
     }
 
     fn start(&self, module: usize, boot: Boot, now: Micros) -> Result<L::Computer, SilError> {
-        let config = self.config;
+        let config = &self.config;
         let node = config.numbers.get(module).copied().unwrap_or(module as u8);
         let mut setup = Config::new(node, self.modules.len() as u8, config.bus, &self.policy);
         setup.bus_off = config.bus_off;
@@ -654,7 +336,7 @@ impl<'c, L: Launcher> Engine<'c, L> {
     }
 
     fn timing(&self) -> Timing {
-        timing_of(self.config, &self.policy, self.modules.len())
+        timing_of(&self.config, &self.policy, self.modules.len())
     }
 
     /// The node of a module, by its place in the line.
@@ -695,9 +377,11 @@ impl<'c, L: Launcher> Engine<'c, L> {
                 self.active.remove(index);
             }
         }
-        if !changed {
-            return Ok(());
-        }
+        if changed { self.obey_faults(plant, now) } else { Ok(()) }
+    }
+
+    /// Makes bus and modules as the active faults have them.
+    fn obey_faults<P: Plant + ?Sized>(&mut self, plant: &P, now: u64) -> Result<(), SilError> {
         let either = |p: f64, q: f64| 1.0 - (1.0 - p) * (1.0 - q);
         let mut disturbance = Disturbance::default();
         let mut cuts = 0u64;
@@ -847,9 +531,7 @@ impl<'c, L: Launcher> Engine<'c, L> {
             && at <= now
         {
             self.next_command += 1;
-            for frame in self.station.command(command) {
-                self.station_port.send_at(&frame, now);
-            }
+            self.order(command, now);
         }
         let foreign = self.modules.len() + 1;
         while let Some(injected) = self.config.injected.get(self.next_injected)
@@ -858,6 +540,13 @@ impl<'c, L: Launcher> Engine<'c, L> {
         {
             self.next_injected += 1;
             let _ = self.bus.send(foreign, &injected.frame, now);
+        }
+    }
+
+    /// The station stops the robot, or releases it.
+    fn order(&mut self, command: StopCommand, now: u64) {
+        for frame in self.station.command(command) {
+            self.station_port.send_at(&frame, now);
         }
     }
 
@@ -894,19 +583,16 @@ impl<'c, L: Launcher> Engine<'c, L> {
         }
     }
 
-    fn handle<P: Plant + ?Sized>(
+    fn handle<P: Plant + ?Sized, W: ?Sized>(
         &mut self,
         plant: &P,
         event: &Event,
-        capture: &mut Option<&mut dyn Write>,
+        watch: &mut dyn Watch<W>,
     ) -> Result<(), SilError> {
         match event {
             Event::Delivered { at_ns, frame, receivers, segment, late, transmitters } => {
-                if let Some(out) = capture
-                    && !late
-                {
-                    let interface = format!("can{}", self.bus.cuts_before(*segment));
-                    candump::write_entry(*out, *at_ns, &interface, frame)?;
+                if !late {
+                    watch.frame(*at_ns, self.bus.cuts_before(*segment) as usize, frame)?;
                 }
                 let mut asked = 0;
                 for node in bus::nodes(*receivers) {
@@ -1079,12 +765,11 @@ impl<'c, L: Launcher> Engine<'c, L> {
         Ok(ready_ns)
     }
 
-    fn view<P: Plant + ?Sized>(
+    fn view(
         &mut self,
         cycle: u32,
         at_ns: u64,
-        plant: &P,
-        observer: &mut dyn FnMut(&CycleView<'_>, &P),
+        seen: &mut dyn FnMut(&CycleView<'_>) -> io::Result<()>,
     ) -> Result<(), SilError> {
         const NOTHING: &[u16; MAX_MODULES] = &[0; MAX_MODULES];
         self.ask_all(at_ns)?;
@@ -1113,7 +798,7 @@ impl<'c, L: Launcher> Engine<'c, L> {
             Fault::Cut(module) => set | 1u64.checked_shl(*module as u32).unwrap_or(0),
             _ => set,
         });
-        observer(&CycleView { cycle, at_ns, modules: &modules, cuts }, plant);
+        seen(&CycleView { cycle, at_ns, modules: &modules, cuts, faults: &self.active })?;
         Ok(())
     }
 

@@ -2,11 +2,14 @@
 
 use super::*;
 use crate::candump;
+use crate::confinement::ErrorCounters;
 use crate::faults::FaultPlan;
+use crate::frame_bits::BitRates;
 use composer_shared::policy::{IMAGE_SIZE, random_image};
 use composer_shared::wire::{EmergencyStop, Fault as Trouble, Message, StopCount};
 
 mod safety;
+mod simulation;
 
 const MS: u64 = 1_000_000;
 
