@@ -8,13 +8,13 @@ use composer_shared::policy::Policy;
 use composer_sim_bridge::faults::FaultPlan;
 use serde::{Deserialize, Serialize};
 
-use super::policy_file::load_run;
 use crate::env::EnvConfig;
 use crate::eval::{PUBLISHED_EPISODES, PUBLISHED_SEED, Trial, healthy};
 use crate::files::write_whole;
 use crate::freeze::{Parity, freeze, parity};
 use crate::outcome::Report;
 use crate::run::RunConfig;
+use crate::run_folder::{load_run, wall_seconds};
 use crate::stats::with_interval;
 
 /// Seeds of the episodes that scales are taken from, and of those that parity is measured on.
@@ -197,13 +197,6 @@ fn commit() -> String {
         Ok(output) if output.status.success() => String::from_utf8_lossy(&output.stdout).trim().to_string(),
         _ => "unknown".into(),
     }
-}
-
-/// Wall time that the last line of a run's metrics tells.
-pub(super) fn wall_seconds(run: &Path) -> f64 {
-    let text = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default();
-    let last = text.lines().last().and_then(|line| serde_json::from_str::<serde_json::Value>(line).ok());
-    last.and_then(|line| line["time/wall_seconds"].as_f64()).unwrap_or(0.0)
 }
 
 /// Runs the verb.

@@ -24,6 +24,8 @@ use composer_shared::policy::Task;
 
 pub use policy_file::PolicySource;
 
+use crate::side_by_side::cores;
+
 /// Decentralised controllers for modular snake robots: train, evaluate, freeze, and prove them on a simulated CAN bus.
 #[derive(Parser)]
 #[command(name = "snakectl", version, about, max_term_width = 110, args_conflicts_with_subcommands = true)]
@@ -132,9 +134,4 @@ fn interrupted() -> std::io::Result<std::sync::Arc<std::sync::atomic::AtomicBool
 fn task_by_name(name: &str) -> Result<Task, String> {
     let names = Task::ALL.map(Task::name);
     Task::from_name(name).ok_or_else(|| format!("there is no such task; the tasks are {}", names.join(", ")))
-}
-
-/// Threads to use when nobody says otherwise: one a core.
-fn cores() -> usize {
-    std::thread::available_parallelism().map_or(1, usize::from)
 }

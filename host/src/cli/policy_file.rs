@@ -10,6 +10,7 @@ use crate::methods::TrainedPolicy;
 use crate::policy;
 use crate::robot::Robot;
 use crate::run::RunConfig;
+use crate::run_folder::load_run;
 use crate::tasks::{AllRules, TaskConfig, TaskSettings};
 
 /// A frozen policy.
@@ -227,32 +228,6 @@ fn check(policy: &Policy, robot: &Robot) -> Result<()> {
         );
     }
     Ok(())
-}
-
-/// Settings of a run, in its folder.
-pub const CONFIG_FILE: &str = "config.toml";
-/// Policy of a run as of its last evaluation, in its folder.
-pub const NETWORK_FILE: &str = "network.json";
-
-/// Reads a settings file.
-pub fn load_config(path: &Path) -> Result<RunConfig> {
-    let text = std::fs::read_to_string(path).with_context(|| format!("cannot read the settings {}", path.display()))?;
-    toml::from_str(&text)
-        .map_err(|e| anyhow::anyhow!("{} has settings that do not fit: {}", path.display(), e.message()))
-}
-
-/// The settings and the policy of a run folder.
-pub fn load_run(folder: &Path) -> Result<(RunConfig, TrainedPolicy)> {
-    let config = load_config(&folder.join(CONFIG_FILE))
-        .with_context(|| format!("{} is no folder of a training run", folder.display()))?;
-    let path = folder.join(NETWORK_FILE);
-    let text = std::fs::read(&path).with_context(|| {
-        format!("cannot read {}; a run writes it at its first evaluation and at its end", path.display())
-    })?;
-    let policy: TrainedPolicy =
-        serde_json::from_slice(&text).with_context(|| format!("{} is damaged", path.display()))?;
-    policy.check().with_context(|| format!("{} is damaged", path.display()))?;
-    Ok((config, policy))
 }
 
 #[cfg(test)]

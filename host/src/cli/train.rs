@@ -1,22 +1,15 @@
 //! `snakectl train`: from nothing to a policy.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Result, bail};
 use composer_shared::policy::Task;
-use crc::{CRC_32_ISO_HDLC, Crc};
 
-use super::policy_file::{CONFIG_FILE, NETWORK_FILE, load_config};
 use super::task_by_name;
-use crate::env::SnakeEnv;
-use crate::eval::{Trial, curve_seed, healthy};
-use crate::files::{create_folder, write_whole};
-use crate::methods::{Method, TrainedPolicy};
-use crate::outcome::Report;
+use crate::methods::Method;
 use crate::robot::Robot;
 use crate::run::RunConfig;
-use crate::train::{TrainSummary, train};
+use crate::run_folder::{CONFIG_FILE, load_config, train_in};
 
 /// Arguments of `train`.
 #[derive(clap::Args, Clone, Debug)]
@@ -101,72 +94,4 @@ pub fn run(arguments: Arguments) -> Result<()> {
         println!("  {name} {value:.3}");
     }
     Ok(())
-}
-
-/// Starts a run in the folder `out`, or goes on with the one that is there. Judges the policy every so often, healthy and (if it trains with
-/// faults) faulty, and keeps the policy of the last judgement. `name`: as in [`train()`].
-pub fn train_in(config: &RunConfig, out: &Path, resuming: bool, name: Option<&str>) -> Result<TrainSummary> {
-    create_folder(out)?;
-    if !resuming {
-        if out.join(CONFIG_FILE).exists() {
-            bail!("{} already holds a run: go on with --resume {0}, or choose another --out", out.display());
-        }
-        write_whole(&out.join(CONFIG_FILE), toml::to_string(config)?.as_bytes())?;
-    }
-    let evaluation = Arc::new(config.evaluation());
-    let faulty = |seed, modules| config.faults.draw(seed, modules);
-    let mut evaluate = |policy: &TrainedPolicy, _steps: u64| {
-        let trial = Trial {
-            config: &evaluation,
-            episodes: config.train.evaluation_episodes.max(1) as usize,
-            seed: curve_seed(config.train.seed),
-            faults: &healthy,
-            threads: config.train.threads(),
-        };
-        let runs = policy.policy();
-        let report = trial.evaluate(&*runs, "none", &|| {});
-        let mut scalars = scalars(&report, "evaluation");
-        if config.faults.probability > 0.0 {
-            let report = Trial { faults: &faulty, ..trial }.evaluate(&*runs, "as trained", &|| {});
-            scalars.extend(self::scalars(&report, "evaluation_faults"));
-        }
-        // A run that is killed keeps the policy of its last evaluation; a failure to write shows at the checkpoint.
-        let _ = save_policy(out, policy);
-        scalars
-    };
-    let make = |index: usize| -> Result<Box<dyn crate::environment::Environment>> {
-        Ok(Box::new(SnakeEnv::new(config.environment(index)?)))
-    };
-    let summary = train(&config.train, &make, &fingerprint(config), out, resuming, name, &mut evaluate)?;
-    save_policy(out, &summary.policy)?;
-    Ok(summary)
-}
-
-/// What goes into the metrics from an evaluation.
-fn scalars(report: &Report, prefix: &str) -> Vec<(String, f64)> {
-    [
-        ("success_rate", report.success_rate),
-        ("distance_mean", report.distance_mean),
-        ("steps_mean", report.steps_mean),
-        ("low_share", report.low_share),
-        ("peak_link_speed", report.peak_link_speed),
-    ]
-    .into_iter()
-    .map(|(name, value)| (format!("{prefix}/{name}"), value))
-    .collect()
-}
-
-fn save_policy(out: &Path, policy: &TrainedPolicy) -> Result<()> {
-    let text = serde_json::to_vec(policy).context("the policy cannot be written as JSON")?;
-    write_whole(&out.join(NETWORK_FILE), &text)
-}
-
-/// What a checkpoint must agree with to be resumed: everything but the learner's own settings, which it checks itself.
-fn fingerprint(config: &RunConfig) -> String {
-    let world = RunConfig { train: Default::default(), ..config.clone() };
-    let digest = Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(toml::to_string(&world).unwrap_or_default().as_bytes());
-    format!(
-        "{} on {} with {} modules, settings {digest:08x}",
-        config.task.name, config.robot.name, config.robot.modules
-    )
 }

@@ -2,6 +2,7 @@
 
 mod attention_maps;
 mod faults;
+mod paper;
 mod physics;
 mod policies;
 mod robustness;
@@ -10,20 +11,18 @@ mod rows;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use anyhow::{Context, Result, bail};
 use composer_shared::policy::Task;
 use serde_json::{Value, json};
 
-use super::policy_file::{CONFIG_FILE, load_config, load_run};
-use super::train::train_in;
 use crate::eval::{PUBLISHED_EPISODES, PUBLISHED_SEED, Trial, healthy};
 use crate::files::{create_folder, write_whole};
 use crate::methods::Method;
 use crate::plot::{Axes, Panel, common_grid, mean_and_error, mean_and_se, panels};
 use crate::run::{Knows, RunConfig};
-use crate::train::Signals;
+use crate::run_folder::{begun, load_run, metrics, trained};
+use crate::side_by_side::side_by_side;
 
 /// Metrics of the imagination policy: its reward, and how far the modules are from where it wanted them.
 const IMAGINATION: [&str; 2] = ["imagination/reward", "imagination/follow_error"];
@@ -47,6 +46,8 @@ enum Which {
     /// All five tasks: composer against itself without imagination and without attention (the paper's ablation), and where the
     /// modules of the complete method attend.
     Ablation(Comparison),
+    /// The paper's comparison: COMPOSER, its ablations and five baselines on all five tasks.
+    Paper(paper::Arguments),
     /// The policies that ship: trained with several seeds, frozen, measured; the one of the median success goes to shared/policies.
     Policies(policies::Arguments),
     /// The physics alone: open-loop experiments over steps, tolerances and solvers, against a far finer reference.
@@ -161,6 +162,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     match &arguments.which {
         Which::Attention(arguments) => compare(What::Attention, arguments),
         Which::Ablation(arguments) => compare(What::Ablation, arguments),
+        Which::Paper(arguments) => paper::run(arguments),
         Which::Policies(arguments) => policies::run(arguments),
         Which::Physics(arguments) => physics::run(arguments),
         Which::Robustness(arguments) => robustness::run(arguments),
@@ -226,72 +228,6 @@ fn finish_all(what: What, runs: &[Run], arguments: &Comparison) -> Result<bool> 
     side_by_side(&folders, arguments.jobs, |number, threads| finish(what, &runs[number], arguments.episodes, threads))
 }
 
-/// Runs `job(index)` for every index below `count` on `threads` threads of their own and returns the results in order. A job has workers of
-/// its own in turn; on a worker's thread it might be begun while another waits for those.
-fn side_by_side_threads<T: Send>(count: usize, threads: usize, job: impl Fn(usize) -> T + Sync) -> Vec<T> {
-    let next = AtomicUsize::new(0);
-    let mut results: Vec<(usize, T)> = std::thread::scope(|scope| {
-        let workers: Vec<_> = (0..threads.max(1))
-            .map(|_| {
-                scope.spawn(|| {
-                    let mut done = Vec::new();
-                    loop {
-                        let index = next.fetch_add(1, Ordering::Relaxed);
-                        if index >= count {
-                            return done;
-                        }
-                        done.push((index, job(index)));
-                    }
-                })
-            })
-            .collect();
-        workers.into_iter().flat_map(|w| w.join().expect("a worker thread does not panic")).collect()
-    });
-    results.sort_by_key(|r| r.0);
-    results.into_iter().map(|r| r.1).collect()
-}
-
-/// Works on all runs, `jobs` at a time (default: the cores), each on its share of the cores: `job` gets a run's number and its threads. False:
-/// interrupted; the runs that had not begun are left out.
-fn side_by_side(folders: &[&Path], jobs: Option<u64>, job: impl Fn(usize, usize) -> Result<()> + Sync) -> Result<bool> {
-    let jobs = jobs.map_or_else(super::cores, |jobs| jobs as usize).min(folders.len()).max(1);
-    let threads = (super::cores() / jobs).max(1);
-    let stop = Signals::new()?;
-    let failed = AtomicBool::new(false);
-    let results = side_by_side_threads(folders.len(), jobs, |number| {
-        if stop.raised() || failed.load(Ordering::Relaxed) {
-            return Ok(());
-        }
-        eprintln!("run {} of {}: {}", number + 1, folders.len(), folders[number].display());
-        job(number, threads).inspect_err(|_| failed.store(true, Ordering::Relaxed))
-    });
-    results.into_iter().collect::<Result<()>>()?;
-    Ok(!stop.raised())
-}
-
-/// Refuses a folder that holds a run with other settings; whether there is one with these.
-fn begun(folder: &Path, config: &RunConfig) -> Result<bool> {
-    let file = folder.join(CONFIG_FILE);
-    if !file.exists() {
-        return Ok(false);
-    }
-    let mut was = load_config(&file)?;
-    was.train.threads = config.train.threads;
-    if was != *config {
-        bail!("{} holds a run with other settings; choose another --runs folder", folder.display());
-    }
-    Ok(true)
-}
-
-/// Trains a run on `threads` threads, or goes on with it. False: interrupted, the next time it goes on from there.
-fn trained(folder: &Path, config: &RunConfig, threads: usize) -> Result<bool> {
-    let mut config = config.clone();
-    config.train.threads = threads;
-    let begun = begun(folder, &config)?;
-    let name = folder.file_name().unwrap_or_default().to_string_lossy();
-    Ok(!train_in(&config, folder, begun, Some(&name))?.interrupted)
-}
-
 /// Trains and evaluates a run on `threads` threads unless that is done; interrupted, it leaves the rest to the next time.
 fn finish(what: What, run: &Run, episodes: u64, threads: usize) -> Result<()> {
     let result = run.folder.join(RESULT_FILE);
@@ -312,15 +248,6 @@ fn finish(what: What, run: &Run, episodes: u64, threads: usize) -> Result<()> {
         results.insert(fault.into(), serde_json::to_value(report)?);
     }
     write_whole(&result, serde_json::to_string_pretty(&results)?.as_bytes())
-}
-
-/// The metrics of a run, one object an iteration.
-fn metrics(folder: &Path) -> Result<Vec<Value>> {
-    let path = folder.join("metrics.jsonl");
-    let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
-    text.lines()
-        .map(|line| serde_json::from_str(line).with_context(|| format!("{} is damaged", path.display())))
-        .collect()
 }
 
 /// Success at each evaluation of a run: (environment steps, share).

@@ -9,14 +9,14 @@ use composer_shared::policy::{Policy, Task};
 use serde_json::{Value, json};
 
 use super::rows::Rows;
-use super::{begun, side_by_side, trained};
-use crate::cli::export::{CALIBRATION_EPISODES, Exported, Measured, SeedRows, freeze_run, measure, rows, wall_seconds};
-use crate::cli::policy_file::{CONFIG_FILE, NETWORK_FILE, load_config};
+use crate::cli::export::{CALIBRATION_EPISODES, Exported, Measured, SeedRows, freeze_run, measure, rows};
 use crate::cli::task_by_name;
 use crate::eval::PUBLISHED_EPISODES;
 use crate::files::{create_folder, write_whole};
 use crate::freeze::Parity;
 use crate::run::RunConfig;
+use crate::run_folder::{CONFIG_FILE, NETWORK_FILE, begun, load_config, trained, wall_seconds};
+use crate::side_by_side::side_by_side;
 use crate::stats::with_interval;
 
 /// The image of a run that has been trained to its end, in its folder.

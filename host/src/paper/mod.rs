@@ -1,0 +1,172 @@
+//! The paper's comparison: COMPOSER, its ablations and five baselines on five tasks, each with three seeds, by one protocol ([`protocol`]).
+//!
+//! A comparison is a list of runs in a fixed order ([`Comparison::runs`]). Whoever works on it, one process or many on many machines, trains each
+//! run in a folder of its own, all of a run's files in it, so that outputs are merged by being looked at together.
+
+pub mod protocol;
+pub mod work;
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Result, bail};
+use composer_shared::policy::Task;
+
+use crate::methods::Method;
+use crate::run::RunConfig;
+
+/// What is compared.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Comparison {
+    /// Methods, in the order in which they are worked on.
+    pub methods: Vec<Method>,
+    /// Tasks.
+    pub tasks: Vec<Task>,
+    /// Seeds.
+    pub seeds: Vec<u64>,
+    /// Environment steps of each run, if not the protocol's; of Block Pushing twice as many.
+    pub steps: Option<u64>,
+    /// Settings of every run that are not the protocol's, `key=value`.
+    pub settings: Vec<String>,
+}
+
+impl Default for Comparison {
+    fn default() -> Self {
+        Comparison {
+            methods: protocol::METHODS.to_vec(),
+            tasks: Task::ALL.to_vec(),
+            seeds: protocol::SEEDS.to_vec(),
+            steps: None,
+            settings: Vec::new(),
+        }
+    }
+}
+
+/// One training run of a comparison.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Run {
+    /// Name of its folder: task, method and seed.
+    pub name: String,
+    /// All settings.
+    pub config: RunConfig,
+}
+
+impl Run {
+    /// Its folder in an output.
+    pub fn folder(&self, out: &Path) -> PathBuf {
+        out.join(&self.name)
+    }
+
+    /// What is trained.
+    pub fn method(&self) -> Method {
+        self.config.train.method
+    }
+
+    /// For what.
+    pub fn task(&self) -> Task {
+        self.config.task.name
+    }
+
+    /// With which seed.
+    pub fn seed(&self) -> u64 {
+        self.config.train.seed
+    }
+}
+
+impl Comparison {
+    /// All runs: those of the first seed, then of the next; of one seed method by method, the cheap ones first. Whatever is stopped, all methods
+    /// that are done have the same tasks and seeds behind them.
+    ///
+    /// # Errors
+    ///
+    /// If a setting is not possible.
+    pub fn runs(&self) -> Result<Vec<Run>> {
+        let mut runs = Vec::new();
+        for &seed in &self.seeds {
+            for &method in &self.methods {
+                for &task in &self.tasks {
+                    let mut config = protocol::settings(task, method, seed, self.steps);
+                    for setting in &self.settings {
+                        config.set(setting)?;
+                    }
+                    config.validate()?;
+                    runs.push(Run { name: format!("{task}-{method}-{seed}"), config });
+                }
+            }
+        }
+        if let Some(twice) =
+            runs.iter().enumerate().find(|(i, run)| runs[..*i].iter().any(|other| other.name == run.name))
+        {
+            bail!("{} is asked for twice; name every method, task and seed once", twice.1.name);
+        }
+        Ok(runs)
+    }
+}
+
+/// One part of the runs: number `index` of `of`, from 1 on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Shard {
+    /// Which part.
+    pub index: usize,
+    /// How many there are.
+    pub of: usize,
+}
+
+impl Shard {
+    /// The runs of this part: every `of`-th, so that each part has some of the slow methods.
+    pub fn select(self, runs: Vec<Run>) -> Vec<Run> {
+        runs.into_iter().skip(self.index - 1).step_by(self.of).collect()
+    }
+}
+
+impl std::str::FromStr for Shard {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let numbers = text.split_once('/').and_then(|(i, n)| Some((i.parse().ok()?, n.parse().ok()?)));
+        match numbers {
+            Some((index, of)) if (1..=of).contains(&index) => Ok(Shard { index, of }),
+            Some((_, of)) => {
+                Err(format!("there is no shard {text}: of {of} shards the first is 1/{of}, the last {of}/{of}"))
+            }
+            None => Err(format!("`{text}` is no shard: write which one and of how many, such as 2/8")),
+        }
+    }
+}
+
+impl std::fmt::Display for Shard {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}/{}", self.index, self.of)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_run_is_in_one_shard_whatever_their_number() {
+        let runs = Comparison::default().runs().unwrap();
+        assert_eq!(runs.len(), 8 * 5 * 3);
+        assert!(runs.windows(2).all(|pair| pair[0].seed() <= pair[1].seed()));
+        assert_eq!(
+            (runs[0].name.as_str(), runs[39].name.as_str()),
+            ("goal-reaching-composer-1", "wall-climbing-smp-1")
+        );
+        for of in [1, 2, 7, 120, 500] {
+            let mut parts: Vec<String> = (1..=of)
+                .flat_map(|index| Shard { index, of }.select(runs.clone()).into_iter().map(|run| run.name))
+                .collect();
+            parts.sort();
+            let mut all: Vec<String> = runs.iter().map(|run| run.name.clone()).collect();
+            all.sort();
+            assert_eq!(parts, all);
+        }
+        assert_eq!("2/8".parse(), Ok(Shard { index: 2, of: 8 }));
+        for text in ["0/8", "9/8", "1/0", "3", "a/b", "-1/4"] {
+            let error = text.parse::<Shard>().unwrap_err();
+            assert!(error.contains(text) && !error.contains('\n'), "{error}");
+        }
+        let twice = Comparison { seeds: vec![1, 1], ..Comparison::default() };
+        assert!(twice.runs().unwrap_err().to_string().contains("asked for twice"));
+    }
+}
