@@ -20,7 +20,7 @@ use rand_chacha::ChaCha8Rng;
 use rapier3d::math::{Rotation, Vector};
 use serde::{Deserialize, Serialize};
 
-use crate::environment::{Environment, Outcome, PRIVILEGED, View};
+use crate::environment::{Environment, KINDS, Lesson, Outcome, PLACES, PRIVILEGED, View, place_of};
 use crate::robot::Robot;
 use crate::sim::{Motion, Snake};
 use crate::tasks::{Judge, Point, Reward, TaskConfig, Verdict};
@@ -32,26 +32,47 @@ use crate::vary::Variation;
 pub struct FaultTraining {
     /// Share of episodes with a fault.
     pub probability: f32,
-    /// Most modules hit in one episode; the number is drawn evenly from 1 to this.
+    /// Most modules hit in one episode. Higher: episodes that are harder, some of them beyond what the body can do. The number is drawn evenly from 1 to
+    /// this; if `mixed`, 1 is drawn twice as often as 2 and three times as often as 3.
     pub most: usize,
-    /// Relative weights of the kinds: action, observation, unplugged.
+    /// Relative weights of the kinds: action, observation, unplugged. Higher: more episodes with that kind.
     pub weights: [f32; 3],
+    /// Every fault of an episode has a kind of its own, may be drawn more often where it is not mastered (`train.curriculum.failure_share`), and starts
+    /// with the episode or, every other one, at any time up to `latest`. If not, all are of one kind, and only unplugging happens on the way.
+    pub mixed: bool,
+    /// Latest start of a fault, s. Higher: more faults come on the way, but also when the episode is over.
+    pub latest: f32,
     /// Share of a module's latents that its neighbours miss, drawn anew each step (frames lost or late).
     pub missed_latents: f32,
 }
 
 impl Default for FaultTraining {
     fn default() -> Self {
-        FaultTraining { probability: 0.0, most: 2, weights: [1.0, 1.0, 2.0], missed_latents: 0.0 }
+        FaultTraining {
+            probability: 0.0,
+            most: 2,
+            weights: [1.0, 1.0, 2.0],
+            mixed: false,
+            latest: 3.0,
+            missed_latents: 0.0,
+        }
     }
 }
 
 impl FaultTraining {
     /// Draws the faults of an episode.
     pub fn draw(&self, seed: u64, modules: usize) -> Vec<ScheduledFault> {
+        self.draw_for(seed, modules, &Lesson::default())
+    }
+
+    /// The same under a curriculum.
+    pub fn draw_for(&self, seed: u64, modules: usize, lesson: &Lesson) -> Vec<ScheduledFault> {
         let rng = &mut ChaCha8Rng::seed_from_u64(seed ^ 0xfa17);
-        if rng.random::<f32>() >= self.probability || modules < 2 {
+        if rng.random::<f32>() >= self.probability * lesson.faults || modules < 2 {
             return Vec::new();
+        }
+        if self.mixed {
+            return self.draw_mixed(rng, modules, lesson);
         }
         let count = rng.random_range(1..=self.most.clamp(1, modules - 1));
         let mut order: Vec<usize> = (0..modules).collect();
@@ -67,12 +88,56 @@ impl FaultTraining {
                 Some(0) => (0, Fault::ActuatorDead(module)),
                 Some(1) => (0, Fault::SensorZeroed(module)),
                 // Half of them from the start: those episodes teach most about living without the module.
-                _ => (if rng.random() { 0 } else { rng.random_range(0..3_000_000_000) }, Fault::Unplug(module)),
+                _ => (if rng.random() { 0 } else { rng.random_range(0..self.latest_ns()) }, Fault::Unplug(module)),
             };
             ScheduledFault { at_ns, until_ns: None, fault }
         });
         hit.collect()
     }
+
+    fn latest_ns(&self) -> u64 {
+        ((f64::from(self.latest) * 1e9).round() as u64).max(1)
+    }
+
+    /// Faults of any kinds, no module hit twice.
+    fn draw_mixed(&self, rng: &mut ChaCha8Rng, modules: usize, lesson: &Lesson) -> Vec<ScheduledFault> {
+        let most = self.most.clamp(1, modules - 1);
+        let count = 1 + pick(rng, (1..=most).map(|count| 1.0 / count as f32));
+        // Weight of each kind of each module: an even part, and one in proportion to how often it fails.
+        let trouble = |kind: usize, module: usize| lesson.failure[kind * PLACES + place_of(module, modules)];
+        let all = (0..KINDS).flat_map(|kind| (0..modules).map(move |module| (kind, module)));
+        let mut pairs: Vec<(usize, usize, f32, f32)> = all
+            .map(|(kind, module)| (kind, module, self.weights[kind], self.weights[kind] * trouble(kind, module)))
+            .collect();
+        (0..count)
+            .map(|_| {
+                let even: f32 = pairs.iter().map(|pair| pair.2).sum();
+                let failing: f32 = pairs.iter().map(|pair| pair.3).sum();
+                let share = if failing > 0.0 { lesson.failure_share } else { 0.0 };
+                let weight = |pair: &(usize, usize, f32, f32)| {
+                    (1.0 - share) * pair.2 / even + if share > 0.0 { share * pair.3 / failing } else { 0.0 }
+                };
+                let (kind, module, ..) = pairs[pick(rng, pairs.iter().map(weight))];
+                pairs.retain(|pair| pair.1 != module);
+                let fault = [Fault::ActuatorDead, Fault::SensorZeroed, Fault::Unplug][kind](module);
+                let at_ns = if rng.random() { 0 } else { rng.random_range(0..self.latest_ns()) };
+                ScheduledFault { at_ns, until_ns: None, fault }
+            })
+            .collect()
+    }
+}
+
+/// Draws a number with these weights.
+fn pick(rng: &mut ChaCha8Rng, weights: impl Iterator<Item = f32> + Clone) -> usize {
+    let mut left = rng.random::<f32>() * weights.clone().sum::<f32>();
+    let last = weights.clone().count() - 1;
+    weights
+        .clone()
+        .position(|weight| {
+            left -= weight;
+            left < 0.0
+        })
+        .unwrap_or(last)
 }
 
 /// Everything that defines the environment.
@@ -134,6 +199,15 @@ impl EnvConfig {
         if self.vary.is_none() { self.clone() } else { Arc::new(self.vary.draw(self, seed)) }
     }
 
+    /// The same, in a share of the episodes only; the others are as if nothing varied.
+    fn drawn_in(self: &Arc<Self>, share: f32, seed: u64) -> Arc<Self> {
+        let varied = share >= 1.0 || ChaCha8Rng::seed_from_u64(seed ^ 0x5a4e).random::<f32>() < share;
+        match varied || self.vary.is_none() {
+            true => self.drawn(seed),
+            false => Arc::new(EnvConfig { vary: Variation::default(), ..(**self).clone() }),
+        }
+    }
+
     /// The start of the episode with this seed: the snake in its scene with its sensors, and the judge. What varies must have been drawn.
     pub fn start(&self, seed: u64) -> (Snake, Judge) {
         let (mut snake, judge) = Judge::start(&self.task, seed, &self.robot);
@@ -185,6 +259,17 @@ impl FaultsNow {
     fn side(&self, module: usize) -> usize {
         usize::from(self.cut.is_some_and(|cut| module > cut))
     }
+
+    /// The troubles that these are, as [`Outcome::troubles`] has them.
+    fn troubles(&self, modules: usize) -> u32 {
+        let mut troubles = 0;
+        for (kind, hit) in [self.weak, self.blind, self.gone].into_iter().enumerate() {
+            for module in (0..modules).filter(|module| hit >> module & 1 == 1) {
+                troubles |= 1 << (kind * PLACES + place_of(module, modules));
+            }
+        }
+        troubles
+    }
 }
 
 /// Whether the environment can show a fault; frames lost, late or broken need a bus.
@@ -203,6 +288,8 @@ pub struct SnakeEnv {
     judge: Judge,
     faults: Vec<ScheduledFault>,
     now: FaultsNow,
+    lesson: Lesson,
+    troubles: u32,
     /// What the modules before and behind a cut believe of the chain; the same without a cut.
     chains: [Chain; 2],
     sensors: Vec<Sensors>,
@@ -229,6 +316,8 @@ impl SnakeEnv {
             judge,
             faults: Vec::new(),
             now: FaultsNow::default(),
+            lesson: Lesson::default(),
+            troubles: 0,
             chains: [Chain::new(config.robot.geometry()), Chain::new(config.robot.geometry())],
             sensors: vec![Sensors::ZERO; modules],
             command: vec![[0.0; 2]; modules],
@@ -246,8 +335,9 @@ impl SnakeEnv {
 
     /// Starts an episode with given faults instead of drawn ones.
     pub fn reset_with(&mut self, seed: u64, faults: &[ScheduledFault]) {
-        let config = self.base.drawn(seed);
+        let config = self.base.drawn_in(self.lesson.varied, seed);
         self.config = config.clone();
+        self.troubles = 0;
         (self.snake, self.judge) = config.start(seed);
         self.rng = ChaCha8Rng::seed_from_u64(seed ^ 0x5eed_fa17);
         self.faults = faults.to_vec();
@@ -263,6 +353,7 @@ impl SnakeEnv {
         let modules = self.config.robot.modules;
         let period_ns = f64::from(self.config.control_period) * 1e9;
         self.now = FaultsNow::at(&self.faults, (f64::from(self.judge.steps()) * period_ns).round() as u64);
+        self.troubles |= self.now.troubles(modules);
         let mut speaking = [0u64; 2];
         for module in 0..modules {
             let bit = 1u64 << module;
@@ -319,8 +410,12 @@ impl Environment for SnakeEnv {
     }
 
     fn reset(&mut self, seed: u64) {
-        let faults = self.config.faults.draw(seed, self.config.robot.modules);
+        let faults = self.config.faults.draw_for(seed, self.config.robot.modules, &self.lesson);
         self.reset_with(seed, &faults);
+    }
+
+    fn teach(&mut self, lesson: &Lesson) {
+        self.lesson = *lesson;
     }
 
     fn view(&self, view: &mut View) {
@@ -409,6 +504,7 @@ impl Environment for SnakeEnv {
             distance,
             steps,
             episode_return: self.episode_return,
+            troubles: self.troubles,
         }
     }
 
@@ -579,6 +675,68 @@ mod tests {
                 crate::tasks::distance(coarse.snake.module_position(module), fine.snake.module_position(module)) < 0.2
             );
         }
+    }
+
+    #[test]
+    fn faults_of_a_lesson_are_mixed_and_go_where_it_fails() {
+        let faults = FaultTraining { probability: 0.8, most: 3, mixed: true, ..FaultTraining::default() };
+        let mut lesson =
+            Lesson { failure_share: 0.5, failure: [0.0; crate::environment::TROUBLES], ..Lesson::default() };
+        // Only dead motors of the third module fail.
+        lesson.failure[2] = 0.9;
+        let episodes = 4000;
+        let (mut count, mut hard, mut kinds_differ, mut late) = ([0usize; 4], 0, 0, 0);
+        for seed in 0..episodes {
+            let drawn = faults.draw_for(seed, 8, &lesson);
+            count[drawn.len()] += 1;
+            let module = |fault: &ScheduledFault| match fault.fault {
+                Fault::ActuatorDead(m) => (0, m),
+                Fault::SensorZeroed(m) => (1, m),
+                Fault::Unplug(m) => (2, m),
+                _ => unreachable!("no such fault is trained with"),
+            };
+            let mut modules: Vec<usize> = drawn.iter().map(|fault| module(fault).1).collect();
+            modules.sort_unstable();
+            modules.dedup();
+            assert_eq!(modules.len(), drawn.len(), "no module is hit twice");
+            hard += usize::from(drawn.iter().any(|fault| module(fault) == (0, 2)));
+            kinds_differ += usize::from(drawn.windows(2).any(|pair| module(&pair[0]).0 != module(&pair[1]).0));
+            late += drawn.iter().filter(|fault| fault.at_ns > 0).count();
+        }
+        let total: usize = (1..4).map(|n| n * count[n]).sum();
+        let share = |n: usize| n as f64 / episodes as f64;
+        // 0.8 of the episodes have faults, 6/11, 3/11 and 2/11 of them one, two and three.
+        for (n, expected) in [0.2, 0.8 * 6.0 / 11.0, 0.8 * 3.0 / 11.0, 0.8 * 2.0 / 11.0].into_iter().enumerate() {
+            assert!((share(count[n]) - expected).abs() < 0.03, "{n}: {}", share(count[n]));
+        }
+        assert!(share(hard) > 0.4 && kinds_differ > 500, "{hard} {kinds_differ}");
+        assert!((late as f64 / total as f64 - 0.5).abs() < 0.03);
+        lesson.faults = 0.5;
+        let fewer = (0..episodes).filter(|seed| !faults.draw_for(*seed, 8, &lesson).is_empty()).count();
+        assert!((share(fewer) - 0.4).abs() < 0.03);
+        // Longer robots have the same places.
+        assert_eq!([0, 1, 7, 8, 15].map(|module| crate::environment::place_of(module, 16)), [0, 0, 3, 4, 7]);
+        assert_eq!(
+            (0..8).map(|module| crate::environment::place_of(module, 8)).collect::<Vec<_>>(),
+            (0..8).collect::<Vec<_>>()
+        );
+    }
+
+    #[test]
+    fn an_episode_says_which_troubles_it_had_and_a_share_of_them_varies() {
+        let vary = crate::vary::Variation::from_toml("mass = [2.0, 2.0]").unwrap();
+        let mut env =
+            SnakeEnv::new(Arc::new(EnvConfig { vary, ..EnvConfig::new(Task::GoalReaching, Robot::default()) }));
+        let fault = |at_ns, fault| ScheduledFault { at_ns, until_ns: None, fault };
+        env.reset_with(1, &[fault(0, Fault::ActuatorDead(2)), fault(75_000_000, Fault::Unplug(7))]);
+        assert_eq!(env.step(&[[0.0; 2]; 8]).troubles, 1 << 2);
+        assert_eq!(env.step(&[[0.0; 2]; 8]).troubles, 1 << 2 | 1 << 23);
+        env.teach(&Lesson { varied: 0.25, ..Lesson::default() });
+        let varied = (0..400).filter(|seed| {
+            env.reset(*seed);
+            env.snake().robot().link_mass > 1.5 * Robot::default().link_mass
+        });
+        assert!((varied.count() as f64 / 400.0 - 0.25).abs() < 0.06);
     }
 
     #[test]

@@ -37,6 +37,55 @@ impl View {
     }
 }
 
+/// Kinds of faults that a [`Lesson`] tells apart: motors dead, sensors blind, unplugged.
+pub const KINDS: usize = 3;
+/// Places along the robot that it tells apart.
+pub const PLACES: usize = 8;
+/// A kind at a place: number `kind * PLACES + place`.
+pub const TROUBLES: usize = KINDS * PLACES;
+
+/// The place of a module, head first: of eight modules each has its own.
+pub fn place_of(module: usize, modules: usize) -> usize {
+    let gaps = modules.max(2) - 1;
+    ((2 * module * (PLACES - 1) + gaps) / (2 * gaps)).min(PLACES - 1)
+}
+
+/// What the episodes that begin now are to be like. By default they are as the environment's settings have them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Lesson {
+    /// The share of episodes with faults is that of the settings times this.
+    pub faults: f32,
+    /// Share of the episodes in which what varies is drawn; 0 to 1.
+    pub varied: f32,
+    /// Share of the faults that is drawn in proportion to `failure`; 0 to 1.
+    pub failure_share: f32,
+    /// How often episodes with each trouble fail, 0 to 1.
+    pub failure: [f32; TROUBLES],
+}
+
+impl Default for Lesson {
+    fn default() -> Self {
+        Self { faults: 1.0, varied: 1.0, failure_share: 0.0, failure: [0.5; TROUBLES] }
+    }
+}
+
+impl Lesson {
+    /// All numbers it is made of; [`Lesson::from_numbers`] takes them back.
+    pub fn numbers(&self) -> impl Iterator<Item = f64> {
+        [self.faults, self.varied, self.failure_share].into_iter().chain(self.failure).map(f64::from)
+    }
+
+    /// One of these numbers; none if they are too few.
+    pub fn from_numbers(numbers: &mut impl Iterator<Item = f64>) -> Option<Self> {
+        let mut next = || numbers.next().map(|x| x as f32);
+        let mut lesson = Self { faults: next()?, varied: next()?, failure_share: next()?, failure: [0.0; TROUBLES] };
+        for failure in &mut lesson.failure {
+            *failure = next()?;
+        }
+        Some(lesson)
+    }
+}
+
 /// What one step of an environment led to.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Outcome {
@@ -54,6 +103,8 @@ pub struct Outcome {
     pub steps: u32,
     /// Sum of the rewards since the reset.
     pub episode_return: f32,
+    /// Faults that the episode has had so far: bit i for trouble i (see [`TROUBLES`]).
+    pub troubles: u32,
 }
 
 /// A robot of several modules with a task.
@@ -65,6 +116,10 @@ pub trait Environment: Send {
     fn modules(&self) -> usize;
     /// Starts an episode; everything random in it comes from the seed.
     fn reset(&mut self, seed: u64);
+    /// Says what the episodes from the next reset on are to be like. Without effect on an environment that has no faults and varies nothing.
+    fn teach(&mut self, lesson: &Lesson) {
+        let _ = lesson;
+    }
     /// Writes what is seen now.
     fn view(&self, view: &mut View);
     /// Applies one action per module (unclipped; the environment clips) for one control step.
@@ -170,6 +225,7 @@ impl Environment for Trivial {
             distance,
             steps: self.steps,
             episode_return: self.episode_return,
+            troubles: 0,
         }
     }
 

@@ -183,6 +183,9 @@ impl RunConfig {
         if !(0.0..=1.0).contains(&faults.probability) || !(0.0..1.0).contains(&faults.missed_latents) {
             bail!("faults.probability and faults.missed_latents are shares: 0 to 1");
         }
+        if !(0.0..=3600.0).contains(&faults.latest) {
+            bail!("faults.latest = {}; it must be from 0 to 3600 s", faults.latest);
+        }
         if faults.weights.iter().any(|w| w.is_nan() || *w < 0.0) || faults.weights.iter().sum::<f32>() <= 0.0 {
             bail!("faults.weights = {:?}; they must be zero or more, one of them above zero", faults.weights);
         }

@@ -8,7 +8,7 @@ use anyhow::{Context, Result, bail};
 use crc::{CRC_32_ISO_HDLC, Crc};
 use serde_json::Value;
 
-use crate::env::SnakeEnv;
+use crate::env::{FaultTraining, SnakeEnv};
 use crate::eval::{Trial, curve_seed, healthy};
 use crate::files::{create_folder, write_whole};
 use crate::methods::TrainedPolicy;
@@ -103,6 +103,16 @@ fn save_policy(out: &Path, policy: &TrainedPolicy) -> Result<()> {
 /// What a checkpoint must agree with to be resumed: everything but the learner's own settings, which it checks itself.
 fn fingerprint(config: &RunConfig) -> String {
     let world = RunConfig { train: Default::default(), ..config.clone() };
+    let mut world = toml::Table::try_from(&world).unwrap_or_default();
+    if let Some(faults) = world.get_mut("faults").and_then(toml::Value::as_table_mut) {
+        // What runs of before these settings trained for is what their defaults say.
+        let defaults = toml::Table::try_from(FaultTraining::default()).unwrap_or_default();
+        for key in ["mixed", "latest", "fixed"] {
+            if faults.get(key) == defaults.get(key) {
+                faults.remove(key);
+            }
+        }
+    }
     let digest = Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(toml::to_string(&world).unwrap_or_default().as_bytes());
     format!(
         "{} on {} with {} modules, settings {digest:08x}",

@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 use super::Method;
 use super::baselines::{MappoConfig, MatConfig, MatDecConfig, PpoConfig};
 use super::composer::Differentiation;
+use super::curriculum::{CurriculumConfig, SecondStage};
 use super::imagination::ImaginationConfig;
 use super::on_policy::update::RATE_LIMITS;
 use super::smp::SmpConfig;
@@ -40,7 +41,7 @@ pub struct TrainConfig {
     pub kl_stop: f64,
     /// Adam's learning rate at the start.
     pub learning_rate: f64,
-    /// Share of it that is left at the end; linear in between. Without effect if `kl_target` is set.
+    /// Share of it that is left at the end of the (first) stage; linear in between. Without effect if `kl_target` is set.
     pub learning_rate_end: f64,
     /// KL divergence an update of the actor should come to. Above 0 the learning rate of each policy is divided by 1.5 after an iteration
     /// whose last minibatch was beyond twice that, multiplied by 1.5 if it was below half of it, and stays between 1e-5 and 1e-2.
@@ -67,6 +68,10 @@ pub struct TrainConfig {
     pub checkpoint_seconds: f64,
     /// Threads; 0 for one per core. The result does not depend on it.
     pub threads: usize,
+    /// What the episodes are like as the run goes on; for the on-policy methods.
+    pub curriculum: CurriculumConfig,
+    /// A second stage at a constant rate; for the on-policy methods.
+    pub second: SecondStage,
     /// The imagination policy, for the methods that have one.
     pub imagination: ImaginationConfig,
     /// `ppo`, whose settings count there instead of those above; what is not among them is shared by all methods.
@@ -110,6 +115,8 @@ impl Default for TrainConfig {
             evaluation_episodes: 50,
             checkpoint_seconds: 60.0,
             threads: 0,
+            curriculum: CurriculumConfig::default(),
+            second: SecondStage::default(),
             imagination: ImaginationConfig::default(),
             ppo: PpoConfig::default(),
             mappo: MappoConfig::default(),
@@ -186,6 +193,8 @@ impl TrainConfig {
         if self.total_steps == 0 {
             bail!("total_steps is 0; it must be at least 1");
         }
+        self.curriculum.validate()?;
+        self.second.validate()?;
         self.imagination.validate()?;
         self.ppo.validate()?;
         self.mappo.validate()?;

@@ -7,6 +7,7 @@
 pub mod baselines;
 pub mod composer;
 pub mod config;
+pub mod curriculum;
 pub mod imagination;
 pub(crate) mod kernels;
 pub mod mappo;

@@ -271,6 +271,8 @@ mod tests {
     use crate::methods::Method;
     use crate::methods::baselines::{MappoConfig, MatConfig};
     use crate::methods::imagination::ImaginationConfig;
+    use crate::robot::Robot;
+    use composer_shared::policy::Task;
 
     fn small(method: Method) -> TrainConfig {
         TrainConfig {
@@ -315,6 +317,41 @@ mod tests {
             }
             assert_eq!(second.checkpoint().unwrap(), straight.checkpoint().unwrap());
             assert_eq!(second.policy(), straight.policy());
+        }
+    }
+
+    #[test]
+    fn a_curriculum_and_a_second_stage_go_on_bit_for_bit_whatever_the_threads() {
+        use crate::env::{EnvConfig, FaultTraining, SnakeEnv};
+        use crate::methods::curriculum::{CurriculumConfig, SecondStage};
+        let make: MakeEnvironment = &|index| {
+            let mut env = EnvConfig::new(Task::GoalReaching, Robot::default().with_modules(6 + index % 3)?);
+            env.faults = FaultTraining { probability: 0.9, most: 3, mixed: true, latest: 0.3, ..env.faults };
+            env.vary = crate::vary::Variation::from_toml("mass = [0.5, 2.0]").unwrap();
+            // Short, so that many episodes end.
+            env.task.settings.cap = 7;
+            Ok(Box::new(SnakeEnv::new(Arc::new(env))))
+        };
+        let config = TrainConfig {
+            total_steps: 6 * 96,
+            curriculum: CurriculumConfig { ramp_steps: 200, failure_share: 0.5, varied: 0.6, ..Default::default() },
+            second: SecondStage { from: 4 * 96, learning_rate: 1e-3, faults: 1.1, varied: 0.9 },
+            ..small(Method::ComposerNoImagination)
+        };
+        let mut straight = Trainer::new(&TrainConfig { threads: 2, ..config.clone() }, make, "snake").unwrap();
+        let reports: Vec<_> = (0..6).map(|_| straight.iterate().unwrap()).collect();
+        let of = |name: &str| reports.iter().map(|report| report.get(name) as f32).collect::<Vec<_>>();
+        assert_eq!(of("curriculum/faults"), [96.0 / 200.0, 192.0 / 200.0, 1.0, 1.1, 1.1, 1.1]);
+        assert_eq!(of("charts/learning_rate")[3..], [5e-4 * (1.0 - 0.75 * 0.9), 1e-3, 1e-3]);
+        for cut in [2, 5] {
+            let mut first = Trainer::new(&TrainConfig { threads: 1, ..config.clone() }, make, "snake").unwrap();
+            (0..cut).for_each(|_| drop(first.iterate().unwrap()));
+            let folder = tempfile::tempdir().unwrap();
+            first.checkpoint().unwrap().write(folder.path()).unwrap();
+            let checkpoint = Checkpoint::read(folder.path()).unwrap();
+            let mut second = Trainer::resume(&checkpoint, &config, make, "snake").unwrap();
+            (cut..6).for_each(|_| drop(second.iterate().unwrap()));
+            assert_eq!(second.checkpoint().unwrap().state, straight.checkpoint().unwrap().state, "cut at {cut}");
         }
     }
 

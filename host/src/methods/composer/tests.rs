@@ -4,7 +4,7 @@ use rand::RngExt;
 
 use super::float::FloatPolicy;
 use super::*;
-use crate::environment::{Drift, Environment, PRIVILEGED, Told, Trivial, View};
+use crate::environment::{Drift, Environment, Lesson, PRIVILEGED, Told, Trivial, View};
 use crate::methods::Method;
 use crate::methods::imagination::displacement;
 use crate::methods::normalise::{Frozen, Running};
@@ -45,7 +45,7 @@ fn rollout(method: Method) -> Rollout {
         Box::new(Trivial::new(5, Told::Head).with_dead(2)),
     ];
     let mut workers: Vec<_> =
-        teams.into_iter().enumerate().map(|(i, team)| RolloutWorker::new(team, i, 5, 0.9)).collect();
+        teams.into_iter().enumerate().map(|(i, team)| RolloutWorker::new(team, i, 5, 0.9, Lesson::default())).collect();
     let mut buffer = RolloutBuffer::new(3);
     let (mut observations, mut privileged) = (Running::new(SIZE), Running::new(PRIVILEGED));
     let rules = Imagination { bound: 0.5, follow: 0.25 };
@@ -56,6 +56,7 @@ fn rollout(method: Method) -> Rollout {
         privileged: Frozen::new(&privileged),
         rewards: None,
         run_seed: 5,
+        lesson: Lesson::default(),
         iteration: 0,
         steps: 16,
     };

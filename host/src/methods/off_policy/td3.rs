@@ -9,7 +9,7 @@ use composer_shared::observation::SIZE;
 use rand::{Rng, RngExt};
 
 use super::replay::{ReplayBuffer, Transitions};
-use crate::environment::{Environment, Outcome};
+use crate::environment::{Environment, Lesson, Outcome};
 use crate::methods::config::TrainConfig;
 use crate::methods::on_policy::RolloutWorker;
 use crate::methods::on_policy::autodiff::{Seen, seen};
@@ -191,7 +191,7 @@ impl<N: DeterministicActorCritic> OffPolicy<N> {
         let mut environments = Vec::with_capacity(settings.environments);
         for index in 0..settings.environments {
             let environment = checked(make(index)?, index)?;
-            environments.push(RolloutWorker::new(environment, index, config.seed, settings.gamma));
+            environments.push(RolloutWorker::new(environment, index, config.seed, settings.gamma, Lesson::default()));
         }
         let modules = environments.first().context("there must be an environment")?.modules();
         if let Some(other) = environments.iter().find(|worker| worker.modules() != modules) {
@@ -360,7 +360,7 @@ impl<N: DeterministicActorCritic> Algorithm for OffPolicy<N> {
             let (seed, gamma) = (self.config.seed, self.settings.gamma);
             let environment: Box<dyn Environment> = checked(make(index)?, index)?;
             self.environments[index] =
-                RolloutWorker::restore(environment, index, seed, gamma, *number, actions.clone());
+                RolloutWorker::restore(environment, index, seed, gamma, (*number, Lesson::default()), actions.clone());
         }
         self.iteration = state.iteration;
         Ok(())

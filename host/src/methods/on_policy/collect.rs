@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::buffer::{Decisions, RolloutBuffer, Trajectory};
 use super::{ActorCritic, Teams};
-use crate::environment::{Environment, PRIVILEGED, View};
+use crate::environment::{Environment, Lesson, PRIVILEGED, View};
 use crate::methods::normalise::{Frozen, Running};
 use crate::methods::random::{Stream, derive_seed, normal_noise, stream};
 use crate::methods::workers::Workers;
@@ -25,6 +25,8 @@ pub struct RolloutWorker {
     modules: usize,
     /// Number of the running episode.
     pub episode: u64,
+    /// What it was to be like.
+    pub lesson: Lesson,
     /// Actions since its reset, all modules of a step together.
     pub actions: Vec<[f32; ACTIONS]>,
     pub(crate) view: View,
@@ -38,8 +40,8 @@ pub struct RolloutWorker {
 
 impl RolloutWorker {
     /// Starts the first episode of the environment `index` of a run.
-    pub fn new(environment: Box<dyn Environment>, index: usize, run_seed: u64, gamma: f32) -> Self {
-        Self::restore(environment, index, run_seed, gamma, 0, Vec::new())
+    pub fn new(environment: Box<dyn Environment>, index: usize, run_seed: u64, gamma: f32, lesson: Lesson) -> Self {
+        Self::restore(environment, index, run_seed, gamma, (0, lesson), Vec::new())
     }
 
     /// Brings an environment back to where it was: starts its episode again and replays the actions.
@@ -48,9 +50,10 @@ impl RolloutWorker {
         index: usize,
         run_seed: u64,
         gamma: f32,
-        episode: u64,
+        (episode, lesson): (u64, Lesson),
         actions: Vec<[f32; ACTIONS]>,
     ) -> Self {
+        environment.teach(&lesson);
         environment.reset(episode_seed(run_seed, index, episode));
         let modules = environment.modules();
         let mut discounted = 0.0;
@@ -64,6 +67,7 @@ impl RolloutWorker {
             index,
             modules,
             episode,
+            lesson,
             actions,
             view,
             observations: Running::new(SIZE),
@@ -117,6 +121,8 @@ pub struct Iteration<'a, C> {
     pub rewards: Option<Frozen<1>>,
     /// Seed of the run.
     pub run_seed: u64,
+    /// What the episodes that begin in it are to be like.
+    pub lesson: Lesson,
     /// Number of the iteration.
     pub iteration: u64,
     /// Steps each environment takes.
@@ -289,6 +295,8 @@ fn run<C: ActorCritic>(
                 worker.episode += 1;
                 worker.actions.clear();
                 worker.discounted = 0.0;
+                worker.lesson = iteration.lesson;
+                worker.environment.teach(&worker.lesson);
                 worker.environment.reset(episode_seed(iteration.run_seed, worker.index, worker.episode));
                 trajectory.episodes.push(outcome);
             }

@@ -19,9 +19,10 @@ pub use self::buffer::{Batch, Decisions, RolloutBuffer, Trajectory};
 pub use self::collect::{Companion, Iteration, RolloutWorker, collect};
 pub use self::update::{Learner, OnPolicySettings, UpdateStats, Workspace, update};
 use super::config::TrainConfig;
+use super::curriculum::{Curriculum, CurriculumConfig};
 use super::normalise::{Frozen, Running};
 use super::{Algorithm, EpisodeState, LearnerState, MakeEnvironment, Report, State, Times, TrainedPolicy, checked};
-use crate::environment::{Outcome, PRIVILEGED};
+use crate::environment::{Lesson, Outcome, PRIVILEGED};
 
 /// What the ratio of new to old density, and its clip, are taken over.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -200,6 +201,8 @@ pub struct OnPolicy<C: ActorCritic> {
     observations: Running,
     privileged: Running,
     returns: Running,
+    /// None: the settings are those of the environments, all along.
+    curriculum: Option<Curriculum>,
     environments: Vec<RolloutWorker>,
     buffer: RolloutBuffer,
     iteration: u64,
@@ -215,14 +218,19 @@ impl<C: ActorCritic> OnPolicy<C> {
         companion: Option<CompanionLearner<C>>,
         make: MakeEnvironment,
     ) -> Result<Self> {
+        let taught = config.curriculum != CurriculumConfig::default() || config.second.from > 0;
+        let curriculum = taught.then(|| Curriculum::new(&config.curriculum, &config.second));
+        let lesson = curriculum.as_ref().map_or_else(Lesson::default, Curriculum::lesson);
         let mut environments = Vec::with_capacity(settings.environments);
         for index in 0..settings.environments {
-            environments.push(RolloutWorker::new(checked(make(index)?, index)?, index, config.seed, settings.gamma));
+            let environment = checked(make(index)?, index)?;
+            environments.push(RolloutWorker::new(environment, index, config.seed, settings.gamma, lesson));
         }
         Ok(Self {
             observations: Running::new(SIZE),
             privileged: Running::new(PRIVILEGED),
             returns: Running::new(1),
+            curriculum,
             buffer: RolloutBuffer::new(settings.environments),
             environments,
             iteration: 0,
@@ -247,7 +255,10 @@ impl<C: ActorCritic> OnPolicy<C> {
     /// The numbers of all normalisers that are in use.
     fn statistics(&self) -> Vec<f64> {
         let returns = self.settings.reward_clip.map(|_| self.returns.numbers());
-        self.observations.numbers().chain(self.privileged.numbers()).chain(returns.into_iter().flatten()).collect()
+        let lessons = || self.environments.iter().flat_map(|worker| worker.lesson.numbers());
+        let curriculum = self.curriculum.iter().flat_map(|curriculum| curriculum.numbers().chain(lessons()));
+        let numbers = self.observations.numbers().chain(self.privileged.numbers());
+        numbers.chain(returns.into_iter().flatten()).chain(curriculum).collect()
     }
 
     fn learners(&self) -> impl Iterator<Item = &Learner<C>> {
@@ -273,6 +284,7 @@ impl<C: ActorCritic> Algorithm for OnPolicy<C> {
             privileged: Frozen::new(&self.privileged),
             rewards: self.settings.reward_clip.map(|clip| Frozen::with_clip(&self.returns, clip)),
             run_seed: self.config.seed,
+            lesson: self.curriculum.as_ref().map_or_else(Lesson::default, Curriculum::lesson),
             iteration: self.iteration,
             steps: self.settings.rollout_steps,
         };
@@ -280,11 +292,13 @@ impl<C: ActorCritic> Algorithm for OnPolicy<C> {
         let workers = &self.workspace.workers;
         let split = collect(&mut self.environments, &mut self.buffer, &iteration, workers, statistics);
         let rollout = began.elapsed();
-        let linear = self
-            .settings
-            .learning_rate_at(self.iteration, self.config.total_steps.div_ceil(self.steps_per_iteration()));
+        let (second, steps) = (&self.config.second, self.iteration * self.steps_per_iteration());
+        // The first stage may be all there is.
+        let first = if second.from > 0 { second.from } else { self.config.total_steps };
+        let constant = second.has_begun(steps).then_some(second.learning_rate as f32);
+        let linear = self.settings.learning_rate_at(self.iteration, first.div_ceil(self.steps_per_iteration()));
         let adaptive = self.settings.kl_target > 0.0;
-        let rate_of = |learner: &Learner<C>| if adaptive { learner.learning_rate } else { linear };
+        let rate_of = |learner: &Learner<C>| constant.unwrap_or(if adaptive { learner.learning_rate } else { linear });
         let learning_rate = rate_of(&self.control);
         let workspace = &mut self.workspace;
         let RolloutBuffer { trajectories, control, companion } = &mut self.buffer;
@@ -303,6 +317,10 @@ impl<C: ActorCritic> Algorithm for OnPolicy<C> {
             );
         }
         self.iteration += 1;
+        let taken = self.steps_per_iteration();
+        if let Some(curriculum) = &mut self.curriculum {
+            curriculum.take(self.buffer.trajectories.iter().flat_map(|trajectory| &trajectory.episodes), taken);
+        }
 
         let wall = began.elapsed();
         // The threads' own times, scaled to the wall time of the rollout they fill together.
@@ -326,6 +344,7 @@ impl<C: ActorCritic> Algorithm for OnPolicy<C> {
             ("charts/sigma".into(), self.control.sigma()),
         ]);
         scalars.extend(stats.scalars().map(|(name, value)| (format!("losses/{name}"), value)));
+        scalars.extend(self.curriculum.iter().flat_map(Curriculum::scalars));
         if let (Some(CompanionLearner { learner, rules, .. }), Some((stats, rate))) = (&self.companion, companion_stats)
         {
             let rewards: f64 = companion.iter().flat_map(|d| &d.rewards).map(|r| f64::from(*r)).sum();
@@ -388,6 +407,19 @@ impl<C: ActorCritic> Algorithm for OnPolicy<C> {
             };
             self.returns = returns;
         }
+        let mut lessons = vec![Lesson::default(); self.environments.len()];
+        if let Some(curriculum) = &mut self.curriculum {
+            let mut restored = || {
+                curriculum.restore(&mut numbers)?;
+                lessons.iter_mut().try_for_each(|lesson| {
+                    *lesson = Lesson::from_numbers(&mut numbers)?;
+                    Some(())
+                })
+            };
+            if restored().is_none() {
+                bail!("the checkpoint has too few statistics: it is of another version");
+            }
+        }
         if state.episodes.len() != self.environments.len() {
             bail!(
                 "the checkpoint has {} environments, the settings say {}",
@@ -402,7 +434,7 @@ impl<C: ActorCritic> Algorithm for OnPolicy<C> {
                 index,
                 self.config.seed,
                 self.settings.gamma,
-                *number,
+                (*number, lessons[index]),
                 actions.clone(),
             );
         }
