@@ -12,7 +12,7 @@ use composer_shared::observation::{self, POINTS, Sensors, Told};
 use composer_shared::policy::{GoalKnownTo, Task};
 use composer_shared::robot::Limits;
 use composer_shared::wire;
-use composer_sim_bridge::faults::{Fault, FaultKind, ScheduledFault};
+use composer_sim_bridge::faults::{Fault, FaultKind, FaultPlan, ScheduledFault};
 use composer_sim_bridge::sensor_model::SensorModel;
 use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
@@ -42,6 +42,8 @@ pub struct FaultTraining {
     pub mixed: bool,
     /// Latest start of a fault, s. Higher: more faults come on the way, but also when the episode is over.
     pub latest: f32,
+    /// Faults that every episode has besides, written as on the command line, such as `action:#3@0s`: for a specialist that knows its fault. Empty: none.
+    pub fixed: String,
     /// Share of a module's latents that its neighbours miss, drawn anew each step (frames lost or late).
     pub missed_latents: f32,
 }
@@ -54,6 +56,7 @@ impl Default for FaultTraining {
             weights: [1.0, 1.0, 2.0],
             mixed: false,
             latest: 3.0,
+            fixed: String::new(),
             missed_latents: 0.0,
         }
     }
@@ -67,6 +70,15 @@ impl FaultTraining {
 
     /// The same under a curriculum.
     pub fn draw_for(&self, seed: u64, modules: usize, lesson: &Lesson) -> Vec<ScheduledFault> {
+        let mut faults = self.draw_random(seed, modules, lesson);
+        if !self.fixed.is_empty() {
+            // It has been checked.
+            faults.extend(self.fixed.parse::<FaultPlan>().map_or_else(|_| Vec::new(), |plan| plan.draw(seed, modules)));
+        }
+        faults
+    }
+
+    fn draw_random(&self, seed: u64, modules: usize, lesson: &Lesson) -> Vec<ScheduledFault> {
         let rng = &mut ChaCha8Rng::seed_from_u64(seed ^ 0xfa17);
         if rng.random::<f32>() >= self.probability * lesson.faults || modules < 2 {
             return Vec::new();

@@ -4,10 +4,11 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
 use composer_shared::policy::{GoalKnownTo, Meta};
+use composer_sim_bridge::faults::FaultPlan;
 use composer_sim_bridge::sensor_model::SensorModel;
 use serde::{Deserialize, Serialize};
 
-use crate::env::{EnvConfig, FaultTraining};
+use crate::env::{EnvConfig, FaultTraining, knows_fault};
 use crate::methods::TrainConfig;
 use crate::robot::Robot;
 use crate::tasks::block_pushing::BlockPushing;
@@ -185,6 +186,15 @@ impl RunConfig {
         }
         if !(0.0..=3600.0).contains(&faults.latest) {
             bail!("faults.latest = {}; it must be from 0 to 3600 s", faults.latest);
+        }
+        if !faults.fixed.is_empty() {
+            let plan: FaultPlan = faults.fixed.parse().map_err(|error| anyhow::anyhow!("faults.fixed: {error}"))?;
+            if let Some(planned) = plan.faults.iter().find(|planned| !knows_fault(&planned.kind)) {
+                bail!(
+                    "faults.fixed = {:?}; training knows unplug, action, observation and cut",
+                    planned.kind.to_string()
+                );
+            }
         }
         if faults.weights.iter().any(|w| w.is_nan() || *w < 0.0) || faults.weights.iter().sum::<f32>() <= 0.0 {
             bail!("faults.weights = {:?}; they must be zero or more, one of them above zero", faults.weights);

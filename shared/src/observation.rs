@@ -36,6 +36,9 @@ use crate::robot::{AXES, MAX_JOINTS};
 /// Numbers in an observation.
 pub const SIZE: usize = 40;
 
+/// How many of them, the first, are the paper's protocol.
+pub const BASE: usize = 40;
+
 /// Points of the scene that a module observes at most.
 pub const POINTS: usize = 3;
 

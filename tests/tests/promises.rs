@@ -194,7 +194,7 @@ fn the_policies_that_ship_are_made_from_nothing_and_the_median_of_the_seeds_ship
     let manifest: toml::Table = toml::from_str(&String::from_utf8(read("s/shape-formation.toml")).unwrap()).unwrap();
     let seeds: Vec<_> = manifest["seeds"].as_array().unwrap().iter().map(|s| s["seed"].as_integer()).collect();
     assert_eq!(seeds, [Some(1), Some(2), Some(3)]);
-    assert_eq!(manifest["measured"].as_array().unwrap().len(), 10);
+    assert_eq!(manifest["measured"].as_array().unwrap().len(), 14);
     let image = read("s/shape-formation.policy");
     let policy = Policy::parse(&image).unwrap();
     assert_eq!(manifest["task_digest"].as_str(), Some(format!("{:08x}", policy.task_digest()).as_str()));

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::{Context, Result};
-use composer_shared::policy::Policy;
+use composer_shared::policy::{Policy, Task};
 use composer_sim_bridge::faults::FaultPlan;
 use serde::{Deserialize, Serialize};
 
@@ -16,6 +16,7 @@ use crate::outcome::Report;
 use crate::run::RunConfig;
 use crate::run_folder::{load_run, wall_seconds};
 use crate::stats::with_interval;
+use crate::vary::{self, Variation};
 
 /// Seeds of the episodes that scales are taken from, and of those that parity is measured on.
 const CALIBRATION_SEED: u64 = 0xca11;
@@ -72,12 +73,15 @@ pub(super) struct SeedRows {
 
 /// One row of measured success: the integer policy in the simulator (`snakectl eval --published`). It is easier there than in training:
 /// [`RunConfig::evaluation`].
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct Measured {
     /// The faults injected.
     pub fault: String,
     /// Modules of the snake.
     pub modules: usize,
+    /// What robot and physics are, if they are not those of the training.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub on: String,
     /// Episodes.
     pub episodes: usize,
     /// Share of successes.
@@ -97,6 +101,7 @@ impl From<Report> for Measured {
         Measured {
             fault: report.fault,
             modules: report.modules,
+            on: String::new(),
             episodes: report.episodes,
             success_rate: report.success_rate,
             success_low: report.success_low,
@@ -107,27 +112,75 @@ impl From<Report> for Measured {
     }
 }
 
-/// The rows that are measured of a policy that was trained on `own` modules: faults, then lengths.
-pub(super) fn rows(own: usize) -> Vec<(usize, &'static str)> {
+/// On what a row is measured.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum On {
+    /// The robot as it should be.
+    Nominal,
+    /// Another robot and floor in every episode ([`vary::LAB`]).
+    Lab,
+    /// The physics step divided by four.
+    Finer,
+}
+
+impl On {
+    /// In tables and data; nothing for the robot as it should be.
+    fn words(self) -> &'static str {
+        match self {
+            On::Nominal => "",
+            On::Lab => vary::LAB_NAME,
+            On::Finer => "physics step / 4",
+        }
+    }
+}
+
+/// A row of what is measured of a policy.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Row {
+    /// Modules of the snake.
+    pub modules: usize,
+    /// Faults.
+    pub fault: &'static str,
+    /// Robot and physics.
+    pub on: On,
+}
+
+impl std::fmt::Display for Row {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{} modules={}", self.fault, self.modules)?;
+        match self.on {
+            On::Nominal => Ok(()),
+            on => write!(f, " on={}", on.words()),
+        }
+    }
+}
+
+/// The rows that are measured of a policy that was trained on `own` modules: faults, other robots, finer physics, then lengths; the longest
+/// of them only where a task is the same for any length.
+pub(super) fn rows(task: Task, own: usize) -> Vec<Row> {
     let faults = ["none", "unplug:1", "unplug:2", "action:1", "action:2", "observation:1"];
-    let lengths = [9, 10, 11, 16].map(|modules| (modules, "none"));
-    faults.map(|fault| (own, fault)).into_iter().chain(lengths).collect()
+    let longest = (task == Task::GoalReaching).then_some(32);
+    let others = [On::Lab, On::Finer].map(|on| Row { modules: own, fault: "none", on });
+    let nominal = |modules, fault| Row { modules, fault, on: On::Nominal };
+    let lengths = [9, 10, 11, 12, 16].into_iter().chain(longest).map(|modules| nominal(modules, "none"));
+    faults.map(|fault| nominal(own, fault)).into_iter().chain(others).chain(lengths).collect()
 }
 
 /// Measures one row on the published episodes.
-pub(super) fn measure(
-    config: &EnvConfig,
-    image: &[u8],
-    (modules, fault): (usize, &str),
-    episodes: u64,
-    threads: usize,
-) -> Result<Measured> {
+pub(super) fn measure(config: &EnvConfig, image: &[u8], row: Row, episodes: u64, threads: usize) -> Result<Measured> {
     let policy = Policy::parse(image).map_err(|e| anyhow::anyhow!("{e}"))?;
-    let plan: FaultPlan = fault.parse().with_context(|| format!("the fault {fault}"))?;
+    let plan: FaultPlan = row.fault.parse().with_context(|| format!("the fault {}", row.fault))?;
     let draw = |seed, modules| plan.draw(seed, modules);
-    let config = Arc::new(EnvConfig { robot: config.robot.with_modules(modules)?, ..config.clone() });
+    let mut config = EnvConfig { robot: config.robot.with_modules(row.modules)?, ..config.clone() };
+    match row.on {
+        On::Nominal => {}
+        On::Lab => config.vary = Variation::from_toml(vary::LAB).map_err(anyhow::Error::msg)?,
+        On::Finer => config = config.finer(4),
+    }
+    let config = Arc::new(config);
     let trial = Trial { config: &config, episodes: episodes as usize, seed: PUBLISHED_SEED, faults: &draw, threads };
-    Ok(trial.evaluate(&policy, fault, &|| {}).into())
+    let report = trial.evaluate(&policy, row.fault, &|| {});
+    Ok(Measured { on: row.on.words().into(), ..report.into() })
 }
 
 /// Freezes the network of a run folder, with scales of `episodes` episodes; the difference of float and integer actions is that of as many others.
@@ -204,7 +257,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let threads = super::cores();
     let (config, image, parity) = freeze_run(&arguments.run, arguments.episodes, threads)?;
     let env = config.evaluation();
-    let measured = rows(config.robot.modules)
+    let measured = rows(config.task.name, config.robot.modules)
         .into_iter()
         .map(|row| measure(&env, &image, row, arguments.measured_episodes, threads))
         .collect::<Result<Vec<_>>>()?;
@@ -212,9 +265,10 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         .with_context(|| format!("cannot read the metrics of {}", arguments.run.display()))?;
     for m in &measured {
         println!(
-            "{:>2} modules, {:<14} success {}, {:.1} steps of at most {}",
+            "{:>2} modules, {:<14} {:<16} success {}, {:.1} steps of at most {}",
             m.modules,
             m.fault,
+            m.on,
             with_interval(m.success_rate, m.success_low, m.success_high, 3),
             m.steps_mean,
             m.cap

@@ -1,7 +1,7 @@
 //! What the on-policy baselines have in common: their settings, how a run of one begins, and the policy that is left at its end.
 
 use anyhow::{Result, bail};
-use composer_shared::observation::SIZE;
+use composer_shared::observation::BASE;
 use serde::{Deserialize, Serialize};
 
 use super::config::TrainConfig;
@@ -265,21 +265,21 @@ impl SavedWeights {
             modules: 0,
             widths: Vec::new(),
             parameters: parameters.to_vec(),
-            mean: vec![0.0; SIZE],
-            std: vec![1.0; SIZE],
+            mean: vec![0.0; BASE],
+            std: vec![1.0; BASE],
             clip: f32::MAX,
         }
     }
 
     /// Of a method that takes them normalised by these statistics, as COMPOSER does.
-    pub fn normalising(method: Method, parameters: &[f32], mean: [f32; SIZE], std: [f32; SIZE]) -> Self {
+    pub fn normalising(method: Method, parameters: &[f32], mean: &[f32], std: &[f32]) -> Self {
         Self { mean: mean.to_vec(), std: std.to_vec(), clip: super::normalise::CLIP, ..Self::raw(method, parameters) }
     }
 
     /// The observations as the networks take them.
     pub fn normalised(&self, view: &View) -> Vec<f32> {
         let of = |(i, x): (usize, &f32)| ((x - self.mean[i]) / self.std[i]).clamp(-self.clip, self.clip);
-        view.observations.iter().flat_map(|observation| observation.iter().enumerate().map(of)).collect()
+        view.observations.iter().flat_map(|observation| observation[..BASE].iter().enumerate().map(of)).collect()
     }
 
     /// Says what is wrong with it, if anything is.
@@ -292,7 +292,7 @@ impl SavedWeights {
             Method::Smp if SmpPolicy::new(self).is_some() => self.parameters.len(),
             method => bail!("its parameters are none of {method}"),
         };
-        if self.parameters.len() != expected || self.mean.len() != SIZE || self.std.len() != SIZE {
+        if self.parameters.len() != expected || self.mean.len() != BASE || self.std.len() != BASE {
             bail!("it has {} parameters where {} has {expected}", self.parameters.len(), self.method);
         }
         if self.parameters.iter().chain(&self.mean).chain(&self.std).any(|x| !x.is_finite()) {
@@ -349,7 +349,7 @@ impl<N: TensorNetworks> Policy for TensorPolicy<'_, N> {
         let n = self.networks.most_modules().map_or(all, |most| all.min(most));
         let heard: Vec<u64> = view.heard[..n].iter().enumerate().map(|(module, heard)| heard | 1 << module).collect();
         let observations = self.saved.normalised(view);
-        let seen = seen(&self.weights, &observations[..n * SIZE], &heard, n);
+        let seen = seen(&self.weights, &observations[..n * BASE], &heard, n);
         let noise = self.weights.tensor(&vec![0.0; n * ACTIONS], [n, ACTIONS]);
         let means = floats(self.networks.act(&self.weights, &seen, noise).0);
         actions.clear();

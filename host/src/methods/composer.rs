@@ -23,11 +23,13 @@ pub mod fused;
 #[cfg(test)]
 mod tests;
 
-use anyhow::Result;
+use std::path::Path;
+
+use anyhow::{Context, Result, bail};
 use composer_shared::observation::SIZE;
 use serde::{Deserialize, Serialize};
 
-use self::actor::{Actor, ActorLayout, ActorScratch, log_probability};
+use self::actor::{Actor, ActorLayout, ActorScratch, Remembered, Shape, log_probability};
 use self::critic::{Critic, CriticLayout, CriticScratch};
 use super::config::TrainConfig;
 use super::imagination::{DISPLACEMENT, Imagination};
@@ -35,11 +37,13 @@ use super::normalise::{CLIP, Forgetting, ValueNorm};
 use super::on_policy::collect::ACTIONS;
 use super::on_policy::update::Standardise;
 use super::on_policy::{
-    ActorCritic, Batch, CompanionLearner, Gradient, Learner, LossSettings, OnPolicy, OnPolicySettings, Part, Ratio,
-    Teams, Valued,
+    ActorCritic, Batch, CompanionLearner, Drawn, Gradient, Learner, LossSettings, OnPolicy, OnPolicySettings, Part,
+    Ratio, Teams, Valued,
 };
 use super::random::{Stream, derive_seed};
 use super::{MakeEnvironment, TrainedPolicy};
+use crate::network::Network;
+use crate::run_folder::load_run;
 
 /// Which code computes the gradients.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -71,12 +75,12 @@ pub struct Scratch {
 }
 
 impl Networks {
-    /// Networks of zeros: an actor with so many actions a module, with attention or without.
-    pub fn new(attention: bool, outputs: usize, gradient: Differentiation) -> Self {
-        let layout = ActorLayout::new(attention, outputs);
+    /// Networks of zeros, with an actor of this shape.
+    pub fn new(shape: Shape, gradient: Differentiation) -> Self {
+        let (layout, critic) = (ActorLayout::new(shape), CriticLayout::new(shape.inputs));
         Self {
             actor: Actor::new(layout, &vec![0.0; layout.len]),
-            critic: Critic::new(&vec![0.0; CriticLayout::default().len]),
+            critic: Critic::new(critic, &vec![0.0; critic.len]),
             gradient,
         }
     }
@@ -84,8 +88,20 @@ impl Networks {
     /// A learner with initial weights; `sigma` is the standard deviation of the actions, `value_gain` the gain of the critic's output.
     pub fn learner(self, seed: u64, sigma: f32, value_gain: f32, epsilon: f32, learning_rate: f32) -> Learner<Self> {
         let actor = self.actor.layout().initial(seed, sigma);
-        let critic = CriticLayout::default().initial(seed, value_gain);
+        let critic = self.critic.layout().initial(seed, value_gain);
         Learner::new(self, seed, actor, critic, ValueNorm::new(Forgetting::Iterations), epsilon, learning_rate)
+    }
+}
+
+impl Networks {
+    /// Appends actions around the means that lie in `scratch`, and the logarithms of their densities.
+    fn draw(&self, noise: &[f32], scratch: &Scratch, actions: &mut Vec<f32>, log_probabilities: &mut Vec<f32>) {
+        let (outputs, log_sigma) = (self.outputs(), self.actor.log_sigma());
+        for (mean, noise) in scratch.actor.means.chunks_exact(outputs).zip(noise.chunks_exact(outputs)) {
+            let first = actions.len();
+            actions.extend((0..outputs).map(|i| mean[i] + log_sigma[i].exp() * noise[i]));
+            log_probabilities.push(log_probability(&actions[first..], mean, log_sigma));
+        }
     }
 }
 
@@ -102,8 +118,16 @@ impl ActorCritic for Networks {
         }
     }
 
+    fn inputs(&self) -> usize {
+        self.actor.layout().inputs()
+    }
+
     fn outputs(&self) -> usize {
         self.actor.layout().outputs()
+    }
+
+    fn memory(&self) -> usize {
+        self.actor.layout().memory()
     }
 
     fn ratio(&self) -> Ratio {
@@ -133,13 +157,24 @@ impl ActorCritic for Networks {
         actions: &mut Vec<f32>,
         log_probabilities: &mut Vec<f32>,
     ) {
-        let (outputs, log_sigma) = (self.outputs(), self.actor.log_sigma());
-        let means = self.actor.means(teams.observations, teams.heard, teams.modules, &mut scratch.actor);
-        for (mean, noise) in means.chunks_exact(outputs).zip(noise.chunks_exact(outputs)) {
-            let first = actions.len();
-            actions.extend((0..outputs).map(|i| mean[i] + log_sigma[i].exp() * noise[i]));
-            log_probabilities.push(log_probability(&actions[first..], mean, log_sigma));
-        }
+        let (observations, modules) = (teams.observations, teams.modules);
+        self.actor.means(observations, teams.heard, modules, Remembered::default(), &mut scratch.actor);
+        self.draw(noise, scratch, actions, log_probabilities);
+    }
+
+    fn sample_remembering(
+        &self,
+        teams: Teams,
+        memory: &mut [f32],
+        noise: &[f32],
+        scratch: &mut Scratch,
+        drawn: &mut Drawn,
+    ) {
+        let follows = vec![false; teams.modules.len()];
+        let before = Remembered { before: memory, follows: &follows };
+        self.actor.means(teams.observations, teams.heard, teams.modules, before, &mut scratch.actor);
+        scratch.actor.remembered(memory);
+        self.draw(noise, scratch, &mut drawn.actions, &mut drawn.log_probabilities);
     }
 
     fn values(&self, teams: Teams, scratch: &mut Scratch, values: &mut Vec<f32>) {
@@ -169,7 +204,7 @@ impl ActorCritic for Networks {
                     sum.add(&self.actor.layout().autodiff(self.actor.parameters(), batch, loss));
                 }
                 if let Some(sum) = critic {
-                    let layout = CriticLayout::default();
+                    let layout = self.critic.layout();
                     sum.add(&layout.autodiff(self.critic.parameters(), batch, loss.team_weight));
                 }
             }
@@ -194,11 +229,15 @@ impl ActorCritic for Networks {
     }
 
     fn rescale(&self, critic: &mut [f32], from: [f32; 2], to: [f32; 2]) {
-        CriticLayout::default().rescale(critic, from, to);
+        self.critic.layout().rescale(critic, from, to);
     }
 
-    fn policy(&self, mean: [f32; SIZE], std: [f32; SIZE]) -> TrainedPolicy {
-        TrainedPolicy::Composer(Box::new(self.actor.layout().network(self.actor.parameters(), mean, std)))
+    fn policy(&self, mean: &[f32], std: &[f32]) -> TrainedPolicy {
+        // Numbers that it does not take are not normalised.
+        let [mut means, mut stds] = [[0.0; SIZE], [1.0; SIZE]];
+        means[..mean.len()].copy_from_slice(mean);
+        stds[..std.len()].copy_from_slice(std);
+        TrainedPolicy::Composer(Box::new(self.actor.layout().network(self.actor.parameters(), means, stds)))
     }
 }
 
@@ -206,14 +245,22 @@ impl ActorCritic for Networks {
 pub fn new(config: &TrainConfig, make: MakeEnvironment) -> Result<OnPolicy<Networks>> {
     let settings = config.composer_settings();
     let (epsilon, rate) = (config.adam_epsilon as f32, config.learning_rate as f32);
-    let networks = Networks::new(config.method.attention(), ACTIONS, config.gradient);
-    let control = networks.learner(config.seed, config.sigma as f32, 1.0, epsilon, rate);
+    let shape = Shape {
+        inputs: config.inputs,
+        memory: config.memory,
+        distance_bias: config.distance_bias,
+        ..Shape::paper(config.method.attention(), ACTIONS)
+    };
+    let networks = Networks::new(shape, config.gradient);
+    let mut control = networks.learner(config.seed, config.sigma as f32, 1.0, epsilon, rate);
+    let start = begin(&mut control, config)?;
     let companion = config.method.imagination().then(|| {
         let seed = derive_seed(config.seed, Stream::Imagination, 0, 0);
         let imagination = &config.imagination;
         // Without attention: it never leaves the training, where nobody has to talk. What is imagined earns a tenth of a unit: a critic that
         // starts with numbers of size 1 would take long to get there.
-        let networks = Networks::new(false, DISPLACEMENT, config.gradient);
+        let shape = Shape { inputs: config.inputs, ..Shape::paper(false, DISPLACEMENT) };
+        let networks = Networks::new(shape, config.gradient);
         CompanionLearner {
             learner: networks.learner(seed, imagination.sigma as f32, 0.01, epsilon, rate),
             rules: Box::new(Imagination { bound: imagination.bound as f32, follow: imagination.follow as f32 }),
@@ -225,7 +272,31 @@ pub fn new(config: &TrainConfig, make: MakeEnvironment) -> Result<OnPolicy<Netwo
             },
         }
     });
-    OnPolicy::new(config, settings, control, companion, make)
+    let mut algorithm = OnPolicy::new(config, settings, control, companion, make)?;
+    if let Some(network) = start {
+        algorithm.know(&network.mean, &network.std);
+    }
+    Ok(algorithm)
+}
+
+/// Gives the control policy the weights of the run that it begins with, if it does with one.
+fn begin(control: &mut Learner<Networks>, config: &TrainConfig) -> Result<Option<Network>> {
+    if config.start.is_empty() {
+        return Ok(None);
+    }
+    let (_, policy) = load_run(Path::new(&config.start)).context("the run to start from")?;
+    let network = policy.network()?;
+    let layout = *control.networks.actor.layout();
+    if layout != ActorLayout::new(Shape::of(network)) {
+        bail!(
+            "the network of {} has another shape than these settings: method, inputs, memory and distance_bias must be those of its run",
+            config.start
+        );
+    }
+    control.actor = layout.parameters(network);
+    control.actor[layout.log_sigma.range()].fill((config.sigma as f32).ln());
+    control.networks.load(Part::Actor, &control.actor);
+    Ok(Some(network.clone()))
 }
 
 impl TrainConfig {

@@ -1,11 +1,13 @@
 //! Settings of a learner.
 
 use anyhow::{Result, bail};
+use composer_shared::observation::{BASE, SIZE};
 use serde::{Deserialize, Serialize};
 
 use super::Method;
 use super::baselines::{MappoConfig, MatConfig, MatDecConfig, PpoConfig};
 use super::composer::Differentiation;
+use super::composer::actor::MEMORY;
 use super::curriculum::{CurriculumConfig, SecondStage};
 use super::imagination::ImaginationConfig;
 use super::on_policy::update::RATE_LIMITS;
@@ -17,6 +19,17 @@ use super::smp::SmpConfig;
 pub struct TrainConfig {
     /// How the policy is built and trained.
     pub method: Method,
+    /// Numbers of an observation that the modules of COMPOSER take, the first: 40, the paper's protocol, or 48, with what a module knows of motors and of
+    /// distances.
+    pub inputs: usize,
+    /// Channels of the embedding that they remember: 0, the paper's protocol, or 16. More: slow things can be told from one another, such as a motor that
+    /// does not answer; an update takes a fifth longer.
+    pub memory: usize,
+    /// Whether their attention has a learnt bias by distance along the chain, which carries to longer robots than were trained on.
+    pub distance_bias: bool,
+    /// Folder of a finished run of COMPOSER whose policy this one begins with, with what it knew of the observations; its critic begins anew. Empty: from
+    /// nothing.
+    pub start: String,
     /// Seed of the run: same seed, same policy, bit for bit, on the same kind of processor.
     pub seed: u64,
     /// Environment steps (control steps of one snake) in all.
@@ -90,6 +103,10 @@ impl Default for TrainConfig {
     fn default() -> Self {
         Self {
             method: Method::Composer,
+            inputs: BASE,
+            memory: 0,
+            distance_bias: false,
+            start: String::new(),
             seed: 1,
             total_steps: 1_000_000,
             environments: 32,
@@ -189,6 +206,15 @@ impl TrainConfig {
             if !(low..=high).contains(&value) {
                 bail!("{key} is {value}; it must be from {low} to {high}");
             }
+        }
+        if self.inputs != BASE && self.inputs != SIZE {
+            bail!("inputs is {}; it must be {BASE}, the paper's protocol, or {SIZE}", self.inputs);
+        }
+        if self.memory != 0 && self.memory != MEMORY {
+            bail!("memory is {}; it must be 0 or {MEMORY}", self.memory);
+        }
+        if self.distance_bias && !self.method.attention() {
+            bail!("distance_bias is of no use to {}, which has no attention", self.method);
         }
         if self.total_steps == 0 {
             bail!("total_steps is 0; it must be at least 1");

@@ -21,7 +21,7 @@ pub enum Start<'a> {
 const LONGEST: usize = 256;
 static ZERO: [f32; LONGEST] = [0.0; LONGEST];
 
-/// `y = start + x w`: `x` is `[rows][inputs]`, `w` is `[inputs][outputs]`, `y` is `[rows][outputs]`; outputs is a multiple of 32.
+/// `y = start + x w`: `x` is `[rows][inputs]`, `w` is `[inputs][outputs]`, `y` is `[rows][outputs]`; outputs is a multiple of 16.
 ///
 /// With `w` one row per input this is the way forth of a layer; with `w` one row per output it is the way back from the gradient of the
 /// outputs to that of the inputs.
@@ -41,7 +41,7 @@ pub fn dense(x: &[f32], inputs: usize, w: &[f32], start: Start, y: &mut [f32]) {
 }
 
 /// `of_w += x^T of_y`, the gradient of a layer's weights, one row per input: `x` is `[rows][inputs]`, `of_y` is `[rows][outputs]`, `of_w`
-/// is `[inputs][outputs]`; outputs is a multiple of 32.
+/// is `[inputs][outputs]`; outputs is a multiple of 16.
 pub fn dense_weights(x: &[f32], inputs: usize, of_y: &[f32], of_w: &mut [f32]) {
     let outputs = of_w.len() / inputs;
     let rows = x.len() / inputs;
@@ -87,62 +87,86 @@ vectorise! {
 #[inline(always)]
 fn product_body<V: Vector>(p: Product, c: &mut [f32]) {
     let Product { rows, columns, steps, .. } = p;
-    assert!(columns.is_multiple_of(2 * V::LANES) && c.len() == rows * columns && p.b.len() == steps * columns);
+    assert!(columns.is_multiple_of(V::LANES) && c.len() == rows * columns && p.b.len() == steps * columns);
     assert!(rows == 0 || steps == 0 || (rows - 1) * p.a_row + (steps - 1) * p.a_step < p.a.len());
     assert!(p.start_stride == columns || p.start.len() == columns);
     // SAFETY: the lengths just checked; `vectorise!` only runs copies for registers that the processor has.
     unsafe {
-        for column in (0..columns).step_by(2 * V::LANES) {
-            let mut row = 0;
-            if V::REGISTERS >= 32 {
-                while row + 8 <= rows {
-                    tile::<V, 8>(&p, row, column, c);
-                    row += 8;
-                }
-            }
-            while row + 4 <= rows {
-                tile::<V, 4>(&p, row, column, c);
-                row += 4;
-            }
-            while row < rows {
-                tile::<V, 1>(&p, row, column, c);
-                row += 1;
-            }
+        let mut column = 0;
+        while column + 2 * V::LANES <= columns {
+            stripe::<V, 2>(&p, column, c);
+            column += 2 * V::LANES;
+        }
+        if column < columns {
+            stripe::<V, 1>(&p, column, c);
         }
     }
 }
 
-/// `N` rows by two registers of columns.
+/// All rows by `W` registers of columns.
+///
+/// # Safety
+///
+/// As for [`tile`].
+#[inline(always)]
+unsafe fn stripe<V: Vector, const W: usize>(p: &Product, column: usize, c: &mut [f32]) {
+    let mut row = 0;
+    // SAFETY: the caller's promise; the rows lie within what `p` and `c` describe.
+    unsafe {
+        if V::REGISTERS >= 32 {
+            while row + 8 <= p.rows {
+                tile::<V, 8, W>(p, row, column, c);
+                row += 8;
+            }
+        }
+        while row + 4 <= p.rows {
+            tile::<V, 4, W>(p, row, column, c);
+            row += 4;
+        }
+        while row < p.rows {
+            tile::<V, 1, W>(p, row, column, c);
+            row += 1;
+        }
+    }
+}
+
+/// `N` rows by `W` registers of columns.
 ///
 /// # Safety
 ///
 /// All of it must lie inside of what `p` and `c` describe, and the processor must have the registers.
 #[inline(always)]
-unsafe fn tile<V: Vector, const N: usize>(p: &Product, row: usize, column: usize, c: &mut [f32]) {
+unsafe fn tile<V: Vector, const N: usize, const W: usize>(p: &Product, row: usize, column: usize, c: &mut [f32]) {
     // SAFETY: see above.
     unsafe {
         let c = c.as_mut_ptr().add(row * p.columns + column);
         let start = if p.start_stride == 0 { p.start.as_ptr().add(column) } else { c.cast_const() };
-        let mut sums = [[V::splat(0.0); 2]; N];
-        for (i, [left, right]) in sums.iter_mut().enumerate() {
-            *left = V::load(start.add(i * p.start_stride));
-            *right = V::load(start.add(i * p.start_stride + V::LANES));
+        let mut sums = [[V::splat(0.0); W]; N];
+        for (i, sums) in sums.iter_mut().enumerate() {
+            for (lane, sum) in sums.iter_mut().enumerate() {
+                *sum = V::load(start.add(i * p.start_stride + lane * V::LANES));
+            }
         }
         let mut a = p.a.as_ptr().add(row * p.a_row);
         let mut b = p.b.as_ptr().add(column);
         for _ in 0..p.steps {
-            let (b_left, b_right) = (V::load(b), V::load(b.add(V::LANES)));
-            for (i, [left, right]) in sums.iter_mut().enumerate() {
+            let mut of_b = [V::splat(0.0); W];
+            for (lane, of_b) in of_b.iter_mut().enumerate() {
+                *of_b = V::load(b.add(lane * V::LANES));
+            }
+            for (i, sums) in sums.iter_mut().enumerate() {
                 let a = V::splat(*a.add(i * p.a_row));
-                *left = a.multiply_add(b_left, *left);
-                *right = a.multiply_add(b_right, *right);
+                for (sum, b) in sums.iter_mut().zip(of_b) {
+                    *sum = a.multiply_add(b, *sum);
+                }
             }
             a = a.wrapping_add(p.a_step);
             b = b.wrapping_add(p.columns);
         }
-        for (i, [left, right]) in sums.iter().enumerate() {
-            left.store(c.add(i * p.columns));
-            right.store(c.add(i * p.columns + V::LANES));
+        for (i, sums) in sums.iter().enumerate() {
+            for (lane, sum) in sums.iter().enumerate() {
+                sum.store(c.add(i * p.columns + lane * V::LANES));
+            }
         }
     }
 }

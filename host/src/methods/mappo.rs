@@ -16,7 +16,7 @@
 
 use burn::tensor::Tensor;
 use burn::tensor::activation::sigmoid;
-use composer_shared::observation::SIZE;
+use composer_shared::observation::BASE;
 
 use super::on_policy::autodiff::{Evaluation, Seen, TensorNetworks};
 use super::on_policy::collect::ACTIONS;
@@ -83,10 +83,10 @@ impl Mappo {
 impl TensorNetworks for Mappo {
     fn layouts(&self) -> [Layout; 2] {
         let (mut actor, mut critic) = (Layout::default(), Layout::default());
-        self.base(&mut actor, "actor", SIZE);
+        self.base(&mut actor, "actor", BASE);
         actor.linear("actor.act.action_out.fc_mean", self.width, ACTIONS, Scheme::Orthogonal(0.01));
         actor.vector(self.log_std(), ACTIONS, if self.squashed { 1.0 } else { 0.0 });
-        self.base(&mut critic, "critic", self.modules * SIZE);
+        self.base(&mut critic, "critic", self.modules * BASE);
         critic.linear("critic.v_out", self.width, 1, Scheme::Orthogonal(1.0));
         [actor, critic]
     }
@@ -113,7 +113,7 @@ impl TensorNetworks for Mappo {
     }
 
     fn values(&self, w: &Weights, seen: &Seen) -> Tensor<2> {
-        let joint = seen.observations.clone().reshape([seen.teams, seen.modules * SIZE]);
+        let joint = seen.observations.clone().reshape([seen.teams, seen.modules * BASE]);
         let values = w.linear("critic.v_out", self.through_base(w, "critic", joint));
         match self.valued {
             Valued::Team => values,
@@ -133,7 +133,7 @@ impl TensorNetworks for Mappo {
         if self.squashed { mat::log_of_sigma(log_std) } else { log_std.to_vec() }
     }
 
-    fn policy(&self, parameters: &[f32], _mean: [f32; SIZE], _std: [f32; SIZE]) -> TrainedPolicy {
+    fn policy(&self, parameters: &[f32], _mean: &[f32], _std: &[f32]) -> TrainedPolicy {
         TrainedPolicy::Weights(SavedWeights { modules: self.modules, ..SavedWeights::raw(Method::Mappo, parameters) })
     }
 }

@@ -21,7 +21,7 @@
 
 use burn::tensor::Tensor;
 use burn::tensor::activation::sigmoid;
-use composer_shared::observation::SIZE;
+use composer_shared::observation::BASE;
 
 use super::on_policy::autodiff::{Evaluation, Seen, TensorNetworks};
 use super::on_policy::collect::ACTIONS;
@@ -69,8 +69,8 @@ fn through_head(w: &Weights, name: &str, x: Tensor<2>) -> Tensor<2> {
 
 /// Adds the layers of the encoder.
 pub fn encoder_layout(layout: &mut Layout) {
-    layout.layer_norm("encoder.obs_encoder.0", SIZE);
-    layout.linear("encoder.obs_encoder.1", SIZE, WIDTH, Scheme::Orthogonal(GAINS[0]));
+    layout.layer_norm("encoder.obs_encoder.0", BASE);
+    layout.linear("encoder.obs_encoder.1", BASE, WIDTH, Scheme::Orthogonal(GAINS[0]));
     layout.layer_norm("encoder.ln", WIDTH);
     layout.layer_norm("encoder.blocks.0.ln1", WIDTH);
     layout.layer_norm("encoder.blocks.0.ln2", WIDTH);
@@ -206,7 +206,7 @@ impl TensorNetworks for Mat {
         log_of_sigma(&parameters[self.layouts()[0].range("decoder.log_std")])
     }
 
-    fn policy(&self, parameters: &[f32], _mean: [f32; SIZE], _std: [f32; SIZE]) -> TrainedPolicy {
+    fn policy(&self, parameters: &[f32], _mean: &[f32], _std: &[f32]) -> TrainedPolicy {
         TrainedPolicy::Weights(SavedWeights::raw(Method::Mat, parameters))
     }
 }

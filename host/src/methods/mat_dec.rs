@@ -6,7 +6,7 @@
 //! what is mended in MAT.
 
 use burn::tensor::Tensor;
-use composer_shared::observation::SIZE;
+use composer_shared::observation::BASE;
 
 use super::mat::{GAINS, WIDTH, encode, encoder_layout, log_of_sigma, sigma, value_cost};
 use super::on_policy::autodiff::{Evaluation, Seen, TensorNetworks};
@@ -25,8 +25,8 @@ impl TensorNetworks for MatDec {
         let mut layout = Layout::default();
         encoder_layout(&mut layout);
         layout.vector("decoder.log_std", ACTIONS, 1.0);
-        layout.layer_norm("decoder.mlp.0", SIZE);
-        layout.linear("decoder.mlp.1", SIZE, WIDTH, Scheme::Orthogonal(GAINS[0]));
+        layout.layer_norm("decoder.mlp.0", BASE);
+        layout.linear("decoder.mlp.1", BASE, WIDTH, Scheme::Orthogonal(GAINS[0]));
         layout.layer_norm("decoder.mlp.3", WIDTH);
         layout.linear("decoder.mlp.4", WIDTH, WIDTH, Scheme::Orthogonal(GAINS[0]));
         layout.layer_norm("decoder.mlp.6", WIDTH);
@@ -70,7 +70,7 @@ impl TensorNetworks for MatDec {
         log_of_sigma(&parameters[self.layouts()[0].range("decoder.log_std")])
     }
 
-    fn policy(&self, parameters: &[f32], _mean: [f32; SIZE], _std: [f32; SIZE]) -> TrainedPolicy {
+    fn policy(&self, parameters: &[f32], _mean: &[f32], _std: &[f32]) -> TrainedPolicy {
         TrainedPolicy::Weights(SavedWeights::raw(Method::MatDec, parameters))
     }
 }

@@ -18,6 +18,12 @@ impl Running {
         Self { count: 0.0, mean: vec![0.0; size], spread: vec![0.0; size] }
     }
 
+    /// As if so many vectors of this mean and standard deviation had been seen.
+    pub fn known(mean: &[f32], std: &[f32], count: f64) -> Self {
+        let spread = std.iter().map(|std| count * f64::from(*std).powi(2)).collect();
+        Self { count, mean: mean.iter().map(|mean| f64::from(*mean)).collect(), spread }
+    }
+
     /// Takes in one vector (Welford).
     pub fn push(&mut self, x: &[f32]) {
         self.count += 1.0;
@@ -64,15 +70,16 @@ impl Running {
     }
 
     /// Mean of each number; 0 before anything is seen.
-    pub fn mean<const N: usize>(&self) -> [f32; N] {
-        std::array::from_fn(|i| self.mean[i] as f32)
+    pub fn mean(&self) -> Vec<f32> {
+        self.mean.iter().map(|mean| *mean as f32).collect()
     }
 
     /// Standard deviation of each number, at least 0.01; 1 before anything is seen.
-    pub fn std<const N: usize>(&self) -> [f32; N] {
-        std::array::from_fn(|i| {
-            if self.count < 1.0 { 1.0 } else { (self.spread[i] / self.count).sqrt().max(STD_FLOOR) as f32 }
-        })
+    pub fn std(&self) -> Vec<f32> {
+        let of = |spread: &f64| {
+            if self.count < 1.0 { 1.0 } else { (spread / self.count).sqrt().max(STD_FLOOR) as f32 }
+        };
+        self.spread.iter().map(of).collect()
     }
 }
 
@@ -80,21 +87,14 @@ impl Running {
 pub const CLIP: f32 = 5.0;
 
 /// Mean and one over the standard deviation of some numbers, frozen for an iteration.
-#[derive(Clone, Copy, Debug)]
-pub struct Frozen<const N: usize> {
-    mean: [f32; N],
-    scale: [f32; N],
+#[derive(Clone, Debug)]
+pub struct Frozen {
+    mean: Vec<f32>,
+    scale: Vec<f32>,
     clip: f32,
 }
 
-impl Frozen<1> {
-    /// A number divided by the standard deviation, its mean left in, and clipped.
-    pub fn scaled(&self, x: f32) -> f32 {
-        (x * self.scale[0]).clamp(-self.clip, self.clip)
-    }
-}
-
-impl<const N: usize> Frozen<N> {
+impl Frozen {
     /// The statistics as they are now.
     pub fn new(running: &Running) -> Self {
         Self::with_clip(running, CLIP)
@@ -102,17 +102,23 @@ impl<const N: usize> Frozen<N> {
 
     /// The same with another limit.
     pub fn with_clip(running: &Running, clip: f32) -> Self {
-        Self { mean: running.mean(), scale: running.std::<N>().map(f32::recip), clip }
+        Self { mean: running.mean(), scale: running.std().into_iter().map(f32::recip).collect(), clip }
     }
 
-    /// Leaves numbers as they are.
-    pub fn off() -> Self {
-        Self { mean: [0.0; N], scale: [1.0; N], clip: f32::MAX }
+    /// Leaves so many numbers as they are.
+    pub fn off(size: usize) -> Self {
+        Self { mean: vec![0.0; size], scale: vec![1.0; size], clip: f32::MAX }
     }
 
-    /// Appends the numbers, normalised and clipped.
-    pub fn apply(&self, x: &[f32; N], out: &mut Vec<f32>) {
-        out.extend((0..N).map(|i| ((x[i] - self.mean[i]) * self.scale[i]).clamp(-self.clip, self.clip)));
+    /// A number divided by the standard deviation, its mean left in, and clipped.
+    pub fn scaled(&self, x: f32) -> f32 {
+        (x * self.scale[0]).clamp(-self.clip, self.clip)
+    }
+
+    /// Appends the numbers, normalised and clipped; those beyond the statistics are left out.
+    pub fn apply(&self, x: &[f32], out: &mut Vec<f32>) {
+        let of = |((x, mean), scale): ((&f32, &f32), &f32)| ((x - mean) * scale).clamp(-self.clip, self.clip);
+        out.extend(x.iter().zip(&self.mean).zip(&self.scale).map(of));
     }
 }
 
@@ -222,8 +228,8 @@ mod tests {
             merged.merge(&running);
         }
         assert_eq!(merged.count(), 50.0);
-        let (a, b): ([f32; 2], [f32; 2]) = (whole.mean(), merged.mean());
-        let (c, d): ([f32; 2], [f32; 2]) = (whole.std(), merged.std());
+        let (a, b) = (whole.mean(), merged.mean());
+        let (c, d) = (whole.std(), merged.std());
         for i in 0..2 {
             assert!((a[i] - b[i]).abs() < 1e-5 && (c[i] - d[i]).abs() < 1e-5);
         }

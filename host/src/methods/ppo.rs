@@ -17,7 +17,7 @@
 //! discounted sum of rewards starts anew with every episode.
 
 use burn::tensor::Tensor;
-use composer_shared::observation::SIZE;
+use composer_shared::observation::BASE;
 
 use super::on_policy::autodiff::{Evaluation, Seen, TensorNetworks};
 use super::on_policy::collect::ACTIONS;
@@ -44,8 +44,8 @@ impl Ppo {
         let Seen { teams, modules, .. } = *seen;
         // A module that the head does not hear is as absent as padding.
         let present = seen.mask.clone().narrow(1, 0, 1).reshape([teams * modules, 1]).clamp(-1.0, 0.0) + 1.0;
-        let joint = (seen.observations.clone() * present).reshape([teams, modules * SIZE]);
-        let missing = (self.modules - modules) * SIZE;
+        let joint = (seen.observations.clone() * present).reshape([teams, modules * BASE]);
+        let missing = (self.modules - modules) * BASE;
         if missing == 0 {
             joint
         } else {
@@ -59,7 +59,7 @@ impl TensorNetworks for Ppo {
         let mut layout = Layout::default();
         let gain = Scheme::Orthogonal(std::f32::consts::SQRT_2);
         for (of, outputs, last) in [("actor_mean", self.modules * ACTIONS, 0.01), ("critic", 1, 1.0)] {
-            layout.linear(&format!("{of}.0"), self.modules * SIZE, WIDTH, gain);
+            layout.linear(&format!("{of}.0"), self.modules * BASE, WIDTH, gain);
             layout.linear(&format!("{of}.2"), WIDTH, WIDTH, gain);
             layout.linear(&format!("{of}.4"), WIDTH, outputs, Scheme::Orthogonal(last));
         }
@@ -108,7 +108,7 @@ impl TensorNetworks for Ppo {
         parameters[self.layouts()[0].range("actor_logstd")].to_vec()
     }
 
-    fn policy(&self, parameters: &[f32], mean: [f32; SIZE], std: [f32; SIZE]) -> TrainedPolicy {
+    fn policy(&self, parameters: &[f32], mean: &[f32], std: &[f32]) -> TrainedPolicy {
         let saved = SavedWeights::raw(Method::Ppo, parameters);
         TrainedPolicy::Weights(SavedWeights {
             modules: self.modules,

@@ -20,7 +20,7 @@
 
 use anyhow::{Result, bail};
 use burn::tensor::Tensor;
-use composer_shared::observation::SIZE;
+use composer_shared::observation::BASE;
 use serde::{Deserialize, Serialize};
 
 use super::config::TrainConfig;
@@ -120,10 +120,10 @@ impl Smp {
 impl DeterministicActorCritic for Smp {
     fn layouts(&self) -> [Layout; 2] {
         let (mut actor, mut critic) = (Layout::default(), Layout::default());
-        Self::up(&mut actor, SIZE);
+        Self::up(&mut actor, BASE);
         self.down(&mut actor, "action_base", 2 * MESSAGE, ACTIONS);
         self.down(&mut actor, "msg_base", 2 * MESSAGE, MESSAGE);
-        Self::up(&mut critic, SIZE + ACTIONS);
+        Self::up(&mut critic, BASE + ACTIONS);
         self.down(&mut critic, "baseQ1", 2 * MESSAGE + ACTIONS, 1);
         self.down(&mut critic, "baseQ2", 2 * MESSAGE + ACTIONS, 1);
         self.down(&mut critic, "msg_base", 2 * MESSAGE, MESSAGE);

@@ -162,15 +162,11 @@ fn finish<'a>(run: &'a Run, arguments: &Arguments, threads: usize) -> Result<Opt
     };
     let (kept, env) = (rows_kept(folder)?, config.evaluation());
     let world = world(&env);
-    let measured = rows(config.robot.modules)
+    let measured = rows(config.task.name, config.robot.modules)
         .into_iter()
-        .map(|(modules, fault)| {
-            let key = format!(
-                "{:08x} {fault} modules={modules} episodes={} world={world:08x}",
-                crc(&image),
-                arguments.episodes
-            );
-            kept.get(&key, || measure(&env, &image, (modules, fault), arguments.episodes, threads))
+        .map(|row| {
+            let key = format!("{:08x} {row} episodes={} world={world:08x}", crc(&image), arguments.episodes);
+            kept.get(&key, || measure(&env, &image, row, arguments.episodes, threads))
         })
         .collect::<Result<Vec<_>>>()?;
     Ok(Some(Done { run, config, image, parity, measured }))
@@ -271,6 +267,15 @@ fn publish(shipped: &[Shipped], out: &Path) -> Result<()> {
     Ok(())
 }
 
+/// What a row is called in the table.
+fn heading(row: &Measured) -> String {
+    match (&*row.fault, &*row.on) {
+        ("none", "") => format!("{} modules, at most {} steps", row.modules, row.cap),
+        ("none", on) => format!("{} modules, {on}", row.modules),
+        (fault, _) => format!("`{fault}`"),
+    }
+}
+
 fn success(row: &Measured, digits: usize) -> String {
     with_interval(row.success_rate, row.success_low, row.success_high, digits)
 }
@@ -284,13 +289,20 @@ fn tables(shipped: &[Shipped]) -> Result<String> {
     let mut table =
         format!("{episodes} episodes a row, 95 % interval (Wilson); the seed of the median success ships.\n\n");
     writeln!(table, "| | {} |\n|---|{}", line(&|done| done.run.task.title().into()), "---|".repeat(chosen.len()))?;
-    for (number, row) in first.measured.iter().enumerate() {
-        let name = match (&*row.fault, number) {
-            ("none", _) => format!("{} modules, at most {} steps", row.modules, row.cap),
-            (fault, _) => format!("`{fault}`"),
+    // A task may have a row that the others do not have.
+    let mut names: Vec<(String, usize)> = Vec::new();
+    for row in chosen.iter().flat_map(|done| &done.measured) {
+        if !names.iter().any(|(name, _)| *name == heading(row)) {
+            names.push((heading(row), names.len()));
+        }
+    }
+    for (name, number) in &names {
+        let cell = |done: &Done| {
+            let row = done.measured.iter().find(|row| heading(row) == *name);
+            row.map_or_else(|| "-".into(), |row| success(row, 3))
         };
-        writeln!(table, "| {name} | {} |", line(&|done| success(&done.measured[number], 3)))?;
-        if number == 0 {
+        writeln!(table, "| {name} | {} |", line(&cell))?;
+        if *number == 0 {
             writeln!(table, "| control steps | {} |", line(&|done| format!("{:.1}", done.measured[0].steps_mean)))?;
         }
     }

@@ -4,10 +4,21 @@
 //! It is the network of [`crate::network`]: encoder, optional attention, hidden layer, two outputs a module, and a standard deviation that
 //! does not depend on the state. That of the imagination policy is the same without attention and with three outputs.
 //!
+//! With a memory, `m <- m + leak (e - m)` over the first channels of the embedding e ([`LEAKS`]), and query, key, value and hidden layer see e and m side
+//! by side. It is linear and each channel is by itself, so the gradient goes back through it in one scan against the time:
+//!
+//! ```text
+//! dm_t = (what the layers say of m_t) + (1 - leak) dm_{t+1}        de_t += leak dm_t
+//! ```
+//!
+//! With a bias of distance the score of a module is the scaled product of query and key plus a number for how far along the chain it is
+//! ([`distance_bucket`]).
+//!
 //! Plain f32 over whole teams, no tensor library, no allocation once the working memory has grown. What a module does depends on its own
 //! team alone, bit for bit: a batch of many teams and a rollout of one agree.
 
-use composer_shared::observation::SIZE;
+use composer_shared::observation::{BASE, SIZE};
+use composer_shared::policy::OUT;
 pub use composer_shared::policy::{EMBED, HIDDEN, KEY, VALUE};
 
 use crate::methods::kernels::{Start, bias_tanh_backward, dense, dense_weights, dot, head, head_backward, tanh};
@@ -17,16 +28,73 @@ use crate::methods::random::{Stream, stream};
 use crate::methods::simd::{Vector, vectorise};
 use crate::network::{Dense, Network};
 
+/// Channels of a memory, if there is one.
+pub const MEMORY: usize = 16;
+/// Share of the way to the embedding that each channel goes in a control step: the first half remembers some 4 steps, the other some 16.
+pub const LEAKS: [f32; MEMORY] = {
+    let mut leaks = [1.0 / 16.0; MEMORY];
+    let mut channel = 0;
+    while channel < MEMORY / 2 {
+        leaks[channel] = 1.0 / 4.0;
+        channel += 1;
+    }
+    leaks
+};
+
+/// Which number of the bias of distance holds for a module that attends to another.
+pub const DISTANCE_BUCKETS: usize = 13;
+
+/// The number of the bias for how far behind `from` a module `to` is along the chain: the same, 1, 2, up to 4, 8, 16 and beyond, in front and behind.
+pub fn distance_bucket(from: usize, to: usize) -> usize {
+    let size = match from.abs_diff(to) {
+        0 => 0,
+        1 => 1,
+        2 => 2,
+        3..=4 => 3,
+        5..=8 => 4,
+        9..=16 => 5,
+        _ => 6,
+    };
+    if to >= from { 6 + size } else { 6 - size }
+}
+
+/// What an actor is made of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Shape {
+    /// Whether it attends to other modules.
+    pub attention: bool,
+    /// Actions of a module.
+    pub outputs: usize,
+    /// Numbers of an observation that it takes, the first.
+    pub inputs: usize,
+    /// Channels that it remembers: none or [`MEMORY`].
+    pub memory: usize,
+    /// Whether attention has a bias by distance along the chain.
+    pub distance_bias: bool,
+}
+
+impl Shape {
+    /// That of a network.
+    pub fn of(network: &Network) -> Self {
+        Self::paper(network.attention, OUT)
+    }
+
+    /// The paper's: the first numbers of the observation, no memory, no bias.
+    pub fn paper(attention: bool, outputs: usize) -> Self {
+        Self { attention, outputs, inputs: BASE, memory: 0, distance_bias: false }
+    }
+}
+
 /// Where things are in an actor's parameters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ActorLayout {
-    /// `[EMBED, SIZE]` weights of the encoder.
+    /// `[EMBED, inputs]` weights of the encoder.
     pub encoder: Block,
     /// Its bias.
     pub encoder_bias: Block,
-    /// Query, key and value weights, one below the other: `[2 KEY + VALUE, EMBED]`. Empty without attention.
+    /// Query, key and value weights, one below the other: `[2 KEY + VALUE, EMBED + memory]`. Empty without attention.
     pub attention: Block,
-    /// Weights of the hidden layer over the own embedding.
+    /// Weights of the hidden layer over the own embedding and memory.
     pub hidden: Block,
     /// Weights of the hidden layer over what attention gathered. Empty without attention.
     pub hidden_context: Block,
@@ -38,27 +106,42 @@ pub struct ActorLayout {
     pub output_bias: Block,
     /// Logarithm of the standard deviation of each action.
     pub log_sigma: Block,
+    /// Bias of attention by distance, one number a bucket. Empty without.
+    pub distance_bias: Block,
     /// Length of the parameter vector.
     pub len: usize,
 }
 
 impl ActorLayout {
-    /// The layout of an actor with so many actions a module, with attention or without.
-    pub fn new(attention: bool, outputs: usize) -> Self {
-        let attention = usize::from(attention);
+    /// The layout of an actor of this shape.
+    pub fn new(shape: Shape) -> Self {
+        let attention = usize::from(shape.attention);
+        let features = EMBED + shape.memory;
         let (
-            [encoder, encoder_bias, attention, hidden, hidden_context, hidden_bias, output, output_bias, log_sigma],
+            [
+                encoder,
+                encoder_bias,
+                attention,
+                hidden,
+                hidden_context,
+                hidden_bias,
+                output,
+                output_bias,
+                log_sigma,
+                distance_bias,
+            ],
             len,
         ) = lay_out([
-            ("encoder.weight", EMBED, SIZE),
+            ("encoder.weight", EMBED, shape.inputs),
             ("encoder.bias", 1, EMBED),
-            ("attention.weight", attention * (2 * KEY + VALUE), EMBED),
-            ("hidden.weight", HIDDEN, EMBED),
+            ("attention.weight", attention * (2 * KEY + VALUE), features),
+            ("hidden.weight", HIDDEN, features),
             ("hidden.context_weight", HIDDEN, attention * VALUE),
             ("hidden.bias", 1, HIDDEN),
-            ("output.weight", outputs, HIDDEN),
-            ("output.bias", 1, outputs),
-            ("log_sigma", 1, outputs),
+            ("output.weight", shape.outputs, HIDDEN),
+            ("output.bias", 1, shape.outputs),
+            ("log_sigma", 1, shape.outputs),
+            ("attention.distance_bias", 1, attention * usize::from(shape.distance_bias) * DISTANCE_BUCKETS),
         ]);
         Self {
             encoder,
@@ -70,8 +153,24 @@ impl ActorLayout {
             output,
             output_bias,
             log_sigma,
+            distance_bias,
             len,
         }
+    }
+
+    /// Numbers of an observation that it takes.
+    pub fn inputs(&self) -> usize {
+        self.encoder.columns
+    }
+
+    /// Channels that it remembers.
+    pub fn memory(&self) -> usize {
+        self.hidden.columns - EMBED
+    }
+
+    /// Numbers that query, key, value and hidden layer see of a module: its embedding, and what it remembers.
+    fn features(&self) -> usize {
+        self.hidden.columns
     }
 
     /// Actions of a module.
@@ -80,7 +179,7 @@ impl ActorLayout {
     }
 
     /// All blocks in order.
-    pub fn blocks(&self) -> [Block; 9] {
+    pub fn blocks(&self) -> [Block; 10] {
         [
             self.encoder,
             self.encoder_bias,
@@ -91,6 +190,7 @@ impl ActorLayout {
             self.output,
             self.output_bias,
             self.log_sigma,
+            self.distance_bias,
         ]
     }
 
@@ -99,19 +199,20 @@ impl ActorLayout {
         let mut p = vec![0.0; self.len];
         let mut rng = stream(seed, Stream::Weights, 0, 0);
         let root2 = std::f32::consts::SQRT_2;
-        p[self.encoder.range()].copy_from_slice(&orthogonal(EMBED, SIZE, root2, &mut rng));
+        p[self.encoder.range()].copy_from_slice(&orthogonal(EMBED, self.inputs(), root2, &mut rng));
+        let features = self.features();
         if !self.attention.is_empty() {
             let parts = [(0, KEY), (KEY, KEY), (2 * KEY, VALUE)];
             for (start, rows) in parts {
-                let from = self.attention.offset + start * EMBED;
-                p[from..from + rows * EMBED].copy_from_slice(&orthogonal(rows, EMBED, 1.0, &mut rng));
+                let from = self.attention.offset + start * features;
+                p[from..from + rows * features].copy_from_slice(&orthogonal(rows, features, 1.0, &mut rng));
             }
         }
         let context = self.hidden_context.columns;
-        let hidden = orthogonal(HIDDEN, EMBED + context, root2, &mut rng);
-        for (row, weights) in hidden.chunks_exact(EMBED + context).enumerate() {
-            p[self.hidden.offset + row * EMBED..][..EMBED].copy_from_slice(&weights[..EMBED]);
-            p[self.hidden_context.offset + row * context..][..context].copy_from_slice(&weights[EMBED..]);
+        let hidden = orthogonal(HIDDEN, features + context, root2, &mut rng);
+        for (row, weights) in hidden.chunks_exact(features + context).enumerate() {
+            p[self.hidden.offset + row * features..][..features].copy_from_slice(&weights[..features]);
+            p[self.hidden_context.offset + row * context..][..context].copy_from_slice(&weights[features..]);
         }
         p[self.output.range()].copy_from_slice(&orthogonal(self.outputs(), HIDDEN, 0.01, &mut rng));
         p[self.log_sigma.range()].fill(sigma.ln());
@@ -188,6 +289,8 @@ pub struct ActorScratch {
     pub means: Vec<f32>,
     /// `[rows, EMBED]`
     embedding: Vec<f32>,
+    /// Embedding and memory, `[rows, EMBED + MEMORY]`, of an actor that remembers.
+    pub(super) features: Vec<f32>,
     /// `[rows, LATENT]`
     pub(super) latent: Vec<f32>,
     /// Weights of attention: `[modules, modules]` for each team.
@@ -198,9 +301,20 @@ pub struct ActorScratch {
     hidden: Vec<f32>,
     of_means: Vec<f32>,
     of_embedding: Vec<f32>,
+    of_features: Vec<f32>,
     of_latent: Vec<f32>,
     of_context: Vec<f32>,
     of_hidden: Vec<f32>,
+}
+
+impl ActorScratch {
+    /// Writes what the modules of the last pass remember now, `[rows, MEMORY]`.
+    pub fn remembered(&self, memory: &mut [f32]) {
+        let features = self.features.as_chunks::<{ EMBED + MEMORY }>().0;
+        for (memory, features) in memory.as_chunks_mut::<MEMORY>().0.iter_mut().zip(features) {
+            memory.copy_from_slice(&features[EMBED..]);
+        }
+    }
 }
 
 /// The matrices that are kept transposed. The output layer is too narrow to gain by it.
@@ -241,31 +355,44 @@ impl Actor {
         !self.layout.attention.is_empty()
     }
 
-    /// Means of the actions of some teams, `[rows, outputs]`: `observations` normalised, `[rows, SIZE]`; `heard` one mask a row, own bit
-    /// set; `modules` of each team.
+    fn bias_of_distance(&self) -> &[f32] {
+        &self.parameters[self.layout.distance_bias.range()]
+    }
+
+    /// Means of the actions of some teams, `[rows, outputs]`: `observations` normalised, `[rows, inputs]`; `heard` one mask a row, own bit
+    /// set; `modules` of each team; `memory` what they remember from the step before.
     pub fn means<'a>(
         &self,
         observations: &[f32],
         heard: &[u64],
         modules: &[usize],
+        memory: Remembered,
         scratch: &'a mut ActorScratch,
     ) -> &'a [f32] {
         let rows = heard.len();
-        let ActorScratch { means, embedding, latent, attention, context, hidden, .. } = scratch;
+        let ActorScratch { means, embedding, features, latent, attention, context, hidden, .. } = scratch;
         let layout = &self.layout;
         let bias = |block: Block| &self.parameters[block.range()];
         let matrix = |block: Block| &self.transposed[block.range()];
         let embedding = room(embedding, rows * EMBED);
-        dense(observations, SIZE, matrix(layout.encoder), Start::Bias(bias(layout.encoder_bias)), embedding);
+        dense(observations, layout.inputs(), matrix(layout.encoder), Start::Bias(bias(layout.encoder_bias)), embedding);
         tanh(embedding);
+        let width = layout.features();
+        let features = if layout.memory() == 0 {
+            &*embedding
+        } else {
+            let features = room(features, rows * width);
+            remember(embedding, modules, memory, features);
+            &*features
+        };
         let hidden = room(hidden, rows * HIDDEN);
-        dense(embedding, EMBED, matrix(layout.hidden), Start::Bias(bias(layout.hidden_bias)), hidden);
+        dense(features, width, matrix(layout.hidden), Start::Bias(bias(layout.hidden_bias)), hidden);
         if self.has_attention() {
             let latent = room(latent, rows * LATENT);
-            dense(embedding, EMBED, matrix(layout.attention), Start::Zero, latent);
+            dense(features, width, matrix(layout.attention), Start::Zero, latent);
             let attention = room(attention, modules.iter().map(|n| n * n).sum());
             let context = room(context, rows * VALUE);
-            attend(latent, heard, modules, attention, context);
+            attend(latent, heard, modules, self.bias_of_distance(), attention, context);
             dense(context, VALUE, matrix(layout.hidden_context), Start::Sum, hidden);
         }
         tanh(hidden);
@@ -276,17 +403,20 @@ impl Actor {
 
     /// Adds PPO's clipped loss over a batch to `sum`, and its gradient, transposed: see [`Actor::finish`].
     pub fn gradient(&self, batch: &Batch, loss: LossSettings, scratch: &mut ActorScratch, sum: &mut Gradient) {
-        self.means(&batch.observations, &batch.heard, &batch.modules, scratch);
+        let memory = Remembered { before: &batch.memory, follows: &batch.follows };
+        self.means(&batch.observations, &batch.heard, &batch.modules, memory, scratch);
         let (layout, rows) = (&self.layout, batch.rows());
         let ActorScratch {
             means,
             embedding,
+            features,
             latent,
             attention,
             context,
             hidden,
             of_means,
             of_embedding,
+            of_features,
             of_latent,
             of_context,
             of_hidden,
@@ -297,25 +427,35 @@ impl Actor {
         let gradient = &mut sum.gradient;
         let weights = |block: Block| &self.parameters[block.range()];
         let (embedding, hidden) = (&embedding[..rows * EMBED], &hidden[..rows * HIDDEN]);
+        let (width, remembers) = (layout.features(), layout.memory() > 0);
+        let features = if remembers { &features[..rows * width] } else { embedding };
         let of_hidden = room(of_hidden, rows * HIDDEN);
         let (of_output, of_bias) = gradient[layout.output.offset..].split_at_mut(layout.output.len());
         let of_bias = &mut of_bias[..layout.outputs()];
         head_backward::<HIDDEN>(hidden, weights(layout.output), of_means, of_hidden, of_output, of_bias);
         bias_tanh_backward(of_hidden, hidden, &mut gradient[layout.hidden_bias.range()]);
-        dense_weights(embedding, EMBED, of_hidden, &mut gradient[layout.hidden.range()]);
-        let of_embedding = room(of_embedding, rows * EMBED);
-        dense(of_hidden, HIDDEN, weights(layout.hidden), Start::Zero, of_embedding);
+        dense_weights(features, width, of_hidden, &mut gradient[layout.hidden.range()]);
+        let of_features = room(of_features, rows * width);
+        dense(of_hidden, HIDDEN, weights(layout.hidden), Start::Zero, of_features);
         if self.has_attention() {
             let (latent, context) = (&latent[..rows * LATENT], &context[..rows * VALUE]);
             let (of_latent, of_context) = (room(of_latent, rows * LATENT), room(of_context, rows * VALUE));
             dense_weights(context, VALUE, of_hidden, &mut gradient[layout.hidden_context.range()]);
             dense(of_hidden, HIDDEN, weights(layout.hidden_context), Start::Zero, of_context);
-            attend_backward(latent, &batch.heard, &batch.modules, attention, of_context, of_latent);
-            dense_weights(embedding, EMBED, of_latent, &mut gradient[layout.attention.range()]);
-            dense(of_latent, LATENT, weights(layout.attention), Start::Sum, of_embedding);
+            let of_distance = &mut gradient[layout.distance_bias.range()];
+            attend_backward(latent, &batch.heard, &batch.modules, attention, of_context, of_latent, of_distance);
+            dense_weights(features, width, of_latent, &mut gradient[layout.attention.range()]);
+            dense(of_latent, LATENT, weights(layout.attention), Start::Sum, of_features);
         }
+        let of_embedding = if remembers {
+            let of_embedding = room(of_embedding, rows * EMBED);
+            remember_backward(of_features, &batch.modules, &batch.follows, of_embedding);
+            of_embedding
+        } else {
+            of_features
+        };
         bias_tanh_backward(of_embedding, embedding, &mut gradient[layout.encoder_bias.range()]);
-        dense_weights(&batch.observations, SIZE, of_embedding, &mut gradient[layout.encoder.range()]);
+        dense_weights(&batch.observations, layout.inputs(), of_embedding, &mut gradient[layout.encoder.range()]);
     }
 
     /// Writes a sum of gradients to `to` in the order of the parameters. The sum is in that order already (`ordered`) or as [`Actor::gradient`] makes it.
@@ -325,6 +465,56 @@ impl Actor {
         if !ordered {
             transpose_back(sum, &matrices(&self.layout), to);
         }
+    }
+}
+
+/// What modules remember from the step before: nothing at all by default, for an actor that does not.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Remembered<'a> {
+    /// As it was kept, `[rows, MEMORY]`.
+    pub before: &'a [f32],
+    /// For each team whether it is the one before it a step later, so that what it remembers comes from there instead.
+    pub follows: &'a [bool],
+}
+
+/// Puts embedding and memory side by side, `[rows, EMBED + MEMORY]`, the memory after the step.
+fn remember(embedding: &[f32], modules: &[usize], memory: Remembered, features: &mut [f32]) {
+    const WIDTH: usize = EMBED + MEMORY;
+    let (embedding, features) = (embedding.as_chunks::<EMBED>().0, features.as_chunks_mut::<WIDTH>().0);
+    let before = memory.before.as_chunks::<MEMORY>().0;
+    let mut first = 0;
+    for (n, follows) in modules.iter().zip(memory.follows) {
+        for row in first..first + n {
+            let mut memory =
+                if *follows { std::array::from_fn(|channel| features[row - n][EMBED + channel]) } else { before[row] };
+            for ((m, e), leak) in memory.iter_mut().zip(&embedding[row]).zip(LEAKS) {
+                *m += leak * (e - *m);
+            }
+            features[row][..EMBED].copy_from_slice(&embedding[row]);
+            features[row][EMBED..].copy_from_slice(&memory);
+        }
+        first += n;
+    }
+}
+
+/// The way back of [`remember`]: from the gradient of embedding and memory, which is changed, to that of the embedding.
+fn remember_backward(of_features: &mut [f32], modules: &[usize], follows: &[bool], of_embedding: &mut [f32]) {
+    const WIDTH: usize = EMBED + MEMORY;
+    let of_features = of_features.as_chunks_mut::<WIDTH>().0;
+    let of_embedding = of_embedding.as_chunks_mut::<EMBED>().0;
+    let mut end = of_features.len();
+    for (n, follows) in modules.iter().zip(follows).rev() {
+        for row in end - n..end {
+            of_embedding[row].copy_from_slice(&of_features[row][..EMBED]);
+            for (channel, leak) in LEAKS.into_iter().enumerate() {
+                let of_memory = of_features[row][EMBED + channel];
+                of_embedding[row][channel] += leak * of_memory;
+                if *follows {
+                    of_features[row - n][EMBED + channel] += (1.0 - leak) * of_memory;
+                }
+            }
+        }
+        end -= n;
     }
 }
 
@@ -379,7 +569,9 @@ fn clipped_loss(
 vectorise! {
     /// Attention of every module over those of its team that it hears: `latent` is `[rows, LATENT]`; its weights go into `attention`, what
     /// they gather into `context`, `[rows, VALUE]`.
-    fn attend(latent: &[f32], heard: &[u64], modules: &[usize], attention: &mut [f32], context: &mut [f32]) = attend_body
+    fn attend(
+        latent: &[f32], heard: &[u64], modules: &[usize], bias: &[f32], attention: &mut [f32], context: &mut [f32]
+    ) = attend_body
 }
 
 #[inline(always)]
@@ -387,6 +579,7 @@ fn attend_body<V: Vector>(
     latent: &[f32],
     heard: &[u64],
     modules: &[usize],
+    bias: &[f32],
     attention: &mut [f32],
     context: &mut [f32],
 ) {
@@ -402,6 +595,9 @@ fn attend_body<V: Vector>(
             for (j, (weight, other)) in weights.iter_mut().zip(team).enumerate() {
                 let audible = heard[first + i] >> j & 1 == 1;
                 *weight = if audible { dot::<V>(query, &other[KEY..2 * KEY]) * scale } else { f32::NEG_INFINITY };
+                if !bias.is_empty() {
+                    *weight += bias[distance_bucket(i, j)];
+                }
                 largest = largest.max(*weight);
             }
             let mut total = 0.0;
@@ -426,7 +622,8 @@ fn attend_body<V: Vector>(
 vectorise! {
     /// The way back of [`attend`]: from the gradient of what was gathered to that of the latents.
     fn attend_backward(
-        latent: &[f32], heard: &[u64], modules: &[usize], attention: &[f32], of_context: &[f32], of_latent: &mut [f32]
+        latent: &[f32], heard: &[u64], modules: &[usize], attention: &[f32], of_context: &[f32], of_latent: &mut [f32],
+        of_bias: &mut [f32]
     ) = attend_backward_body
 }
 
@@ -438,6 +635,7 @@ fn attend_backward_body<V: Vector>(
     attention: &[f32],
     of_context: &[f32],
     of_latent: &mut [f32],
+    of_bias: &mut [f32],
 ) {
     let (latent, of_context) = (latent.as_chunks::<LATENT>().0, of_context.as_chunks::<VALUE>().0);
     let of_latent = of_latent.as_chunks_mut::<LATENT>().0;
@@ -465,6 +663,9 @@ fn attend_backward_body<V: Vector>(
             for (j, other) in team.iter().enumerate() {
                 if heard[first + i] >> j & 1 == 1 {
                     let of_score = scale * weights[j] * (of_weights[j] - mean);
+                    if !of_bias.is_empty() {
+                        of_bias[distance_bucket(i, j)] += weights[j] * (of_weights[j] - mean);
+                    }
                     let (key, of_key) = (&other[KEY..2 * KEY], &mut of_team[j][KEY..2 * KEY]);
                     for k in 0..KEY {
                         of_query[k] = V::scalar(of_score, key[k], of_query[k]);

@@ -4,10 +4,9 @@
 //! Samples are padded to the longest of the batch: tensors have one shape.
 
 use burn::tensor::activation::softmax;
-use burn::tensor::{Device, Tensor, TensorData};
-use composer_shared::observation::SIZE;
+use burn::tensor::{Device, Int, Tensor, TensorData};
 
-use super::actor::{ActorLayout, EMBED, KEY, LOG_DENSITY_CONSTANT, VALUE};
+use super::actor::{ActorLayout, EMBED, KEY, LEAKS, LOG_DENSITY_CONSTANT, MEMORY, VALUE, distance_bucket};
 use super::critic::CriticLayout;
 use super::fused::bias_tanh;
 use crate::environment::PRIVILEGED;
@@ -66,10 +65,42 @@ fn collect<const N: usize>(
     flat
 }
 
+/// Embedding and memory side by side: the samples of a batch one after the other, each with what the one before it remembered or with what was kept.
+fn remembering(embedding: Tensor<2>, batch: &Batch, device: &Device) -> Tensor<2> {
+    let modules = longest(batch);
+    let kept = Tensor::<2>::from_data(
+        TensorData::new(padded(batch, &batch.memory, MEMORY), [batch.samples() * modules, MEMORY]),
+        device,
+    );
+    let leaks = Tensor::<2>::from_data(TensorData::new(LEAKS.to_vec(), [1, MEMORY]), device);
+    let mut memories: Vec<Tensor<2>> = Vec::new();
+    for (sample, follows) in batch.follows.iter().enumerate() {
+        let rows = sample * modules..(sample + 1) * modules;
+        let before = match memories.last() {
+            Some(last) if *follows => last.clone(),
+            _ => kept.clone().slice([rows.clone(), 0..MEMORY]),
+        };
+        let e = embedding.clone().slice([rows, 0..MEMORY]);
+        memories.push(before.clone() + (e - before) * leaks.clone());
+    }
+    Tensor::cat(vec![embedding, Tensor::cat(memories, 0)], 1)
+}
+
 impl ActorLayout {
     /// Means of the actions, `[samples * modules, outputs]`.
-    fn forward(&self, p: &[Option<Tensor<2>>; 9], batch: &Batch, device: &Device) -> Tensor<2> {
-        let [encoder, encoder_bias, attention, hidden, hidden_context, hidden_bias, output, output_bias, _] = p;
+    fn forward(&self, p: &[Option<Tensor<2>>; 10], batch: &Batch, device: &Device) -> Tensor<2> {
+        let [
+            encoder,
+            encoder_bias,
+            attention,
+            hidden,
+            hidden_context,
+            hidden_bias,
+            output,
+            output_bias,
+            _,
+            distance_bias,
+        ] = p;
         let [Some(encoder), Some(encoder_bias), Some(hidden), Some(hidden_bias), Some(output), Some(output_bias)] =
             [encoder, encoder_bias, hidden, hidden_bias, output, output_bias].map(Clone::clone)
         else {
@@ -77,9 +108,12 @@ impl ActorLayout {
         };
         let (samples, modules) = (batch.samples(), longest(batch));
         let rows = samples * modules;
-        let observations = padded(batch, &batch.observations, SIZE);
-        let x = Tensor::<2>::from_data(TensorData::new(observations, [rows, SIZE]), device);
-        let e = bias_tanh(x.matmul(encoder.transpose()), encoder_bias);
+        let observations = padded(batch, &batch.observations, self.inputs());
+        let x = Tensor::<2>::from_data(TensorData::new(observations, [rows, self.inputs()]), device);
+        let mut e = bias_tanh(x.matmul(encoder.transpose()), encoder_bias);
+        if self.memory() > 0 {
+            e = remembering(e, batch, device);
+        }
         let mut h = e.clone().matmul(hidden.transpose());
         if let (Some(attention), Some(hidden_context)) = (attention.clone(), hidden_context.clone()) {
             let qkv = e.matmul(attention.transpose()).reshape([samples, modules, 2 * KEY + VALUE]);
@@ -97,7 +131,13 @@ impl ActorLayout {
                 }
             }
             let mask = Tensor::<3>::from_data(TensorData::new(mask, [samples, modules, modules]), device);
-            let scores = q.matmul(k.swap_dims(1, 2)) * (KEY as f32).sqrt().recip() + mask;
+            let mut scores = q.matmul(k.swap_dims(1, 2)) * (KEY as f32).sqrt().recip() + mask;
+            if let Some(bias) = distance_bias.clone() {
+                let of = |from| (0..modules).map(move |to| distance_bucket(from, to) as i32);
+                let buckets: Vec<i32> = (0..modules).flat_map(of).collect();
+                let buckets = Tensor::<1, Int>::from_data(TensorData::new(buckets, [modules * modules]), device);
+                scores = scores + bias.select(1, buckets).reshape([1, modules, modules]);
+            }
             let context = softmax(scores, 2).matmul(v).reshape([rows, VALUE]);
             h = h + context.matmul(hidden_context.transpose());
         }
@@ -166,7 +206,10 @@ impl CriticLayout {
         let part = |numbers: &[f32], columns| {
             Tensor::<2>::from_data(TensorData::new(padded(batch, numbers, columns), [rows, columns]), device)
         };
-        let x = Tensor::cat(vec![part(&batch.observations, SIZE), part(&batch.privileged, PRIVILEGED)], 1);
+        let x = Tensor::cat(
+            vec![part(&batch.observations, self.first.columns - PRIVILEGED), part(&batch.privileged, PRIVILEGED)],
+            1,
+        );
         let h = bias_tanh(x.matmul(first.transpose()), first_bias);
         let h = bias_tanh(h.matmul(second.transpose()), second_bias).reshape([samples, modules, EMBED]);
         // Row 0 takes the mean over the modules that are there, row 1 the head.

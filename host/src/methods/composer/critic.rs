@@ -3,17 +3,12 @@
 //! It sees the whole team: the same two layers for every module, then the mean over the modules beside the head module's embedding, so that
 //! it works for any number of modules.
 
-use composer_shared::observation::SIZE;
-
 use super::actor::{EMBED, HIDDEN};
 use crate::environment::PRIVILEGED;
 use crate::methods::kernels::{Start, bias_tanh_backward, dense, dense_weights, head, head_backward, tanh};
 use crate::methods::on_policy::{Batch, Gradient};
 use crate::methods::parameters::{Block, lay_out, orthogonal, room, transpose, transpose_back};
 use crate::methods::random::{Stream, stream};
-
-/// What the critic knows of a module.
-pub const CRITIC_INPUT: usize = SIZE + PRIVILEGED;
 
 /// Where things are in the critic's parameters.
 #[derive(Clone, Copy, Debug)]
@@ -38,10 +33,11 @@ pub struct CriticLayout {
     pub len: usize,
 }
 
-impl Default for CriticLayout {
-    fn default() -> Self {
+impl CriticLayout {
+    /// The layout of a critic that takes so many numbers of an observation, the first, and all privileged ones.
+    pub fn new(inputs: usize) -> Self {
         let ([first, first_bias, second, second_bias, team, team_bias, value, value_bias], len) = lay_out([
-            ("first.weight", EMBED, CRITIC_INPUT),
+            ("first.weight", EMBED, inputs + PRIVILEGED),
             ("first.bias", 1, EMBED),
             ("second.weight", EMBED, EMBED),
             ("second.bias", 1, EMBED),
@@ -52,9 +48,12 @@ impl Default for CriticLayout {
         ]);
         Self { first, first_bias, second, second_bias, team, team_bias, value, value_bias, len }
     }
-}
 
-impl CriticLayout {
+    /// Numbers of an observation that it takes.
+    fn inputs(&self) -> usize {
+        self.first.columns - PRIVILEGED
+    }
+
     /// All blocks in order.
     pub fn blocks(&self) -> [Block; 8] {
         [
@@ -131,8 +130,7 @@ fn matrices(layout: &CriticLayout) -> [Block; 3] {
 
 impl Critic {
     /// A critic with these parameters.
-    pub fn new(parameters: &[f32]) -> Self {
-        let layout = CriticLayout::default();
+    pub fn new(layout: CriticLayout, parameters: &[f32]) -> Self {
         let mut critic = Self { layout, parameters: vec![0.0; layout.len], transposed: vec![0.0; layout.len] };
         critic.load(parameters);
         critic
@@ -143,13 +141,18 @@ impl Critic {
         &self.parameters
     }
 
+    /// Where things are in the parameters.
+    pub fn layout(&self) -> &CriticLayout {
+        &self.layout
+    }
+
     /// Takes other parameters.
     pub fn load(&mut self, parameters: &[f32]) {
         self.parameters.copy_from_slice(parameters);
         transpose(parameters, &matrices(&self.layout), &mut self.transposed);
     }
 
-    /// Values of some teams on the critic's scale: `observations` are `[rows, SIZE]`, `privileged` numbers `[rows, PRIVILEGED]`, both
+    /// Values of some teams on the critic's scale: `observations` are `[rows, inputs]`, `privileged` numbers `[rows, PRIVILEGED]`, both
     /// normalised; `modules` of each team.
     pub fn values<'a>(
         &self,
@@ -158,14 +161,15 @@ impl Critic {
         modules: &[usize],
         scratch: &'a mut CriticScratch,
     ) -> &'a [f32] {
-        let (rows, teams) = (observations.len() / SIZE, modules.len());
+        let inputs = self.layout.inputs();
+        let (rows, teams) = (observations.len() / inputs, modules.len());
         let CriticScratch { values, first, second, pooled, team, .. } = scratch;
         let layout = &self.layout;
         let bias = |block: Block| &self.parameters[block.range()];
         let matrix = |block: Block| &self.transposed[block.range()];
-        let (of_observations, of_privileged) = matrix(layout.first).split_at(SIZE * EMBED);
+        let (of_observations, of_privileged) = matrix(layout.first).split_at(inputs * EMBED);
         let first = room(first, rows * EMBED);
-        dense(observations, SIZE, of_observations, Start::Bias(bias(layout.first_bias)), first);
+        dense(observations, inputs, of_observations, Start::Bias(bias(layout.first_bias)), first);
         dense(privileged, PRIVILEGED, of_privileged, Start::Sum, first);
         tanh(first);
         let second = room(second, rows * EMBED);
@@ -232,8 +236,8 @@ impl Critic {
         let of_first = room(of_first, rows * EMBED);
         dense(of_second, EMBED, weights(layout.second), Start::Zero, of_first);
         bias_tanh_backward(of_first, first, &mut gradient[layout.first_bias.range()]);
-        let (of_observations, of_privileged) = gradient[layout.first.range()].split_at_mut(SIZE * EMBED);
-        dense_weights(&batch.observations, SIZE, of_first, of_observations);
+        let (of_observations, of_privileged) = gradient[layout.first.range()].split_at_mut(layout.inputs() * EMBED);
+        dense_weights(&batch.observations, layout.inputs(), of_first, of_observations);
         dense_weights(&batch.privileged, PRIVILEGED, of_first, of_privileged);
     }
 

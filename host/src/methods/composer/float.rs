@@ -5,7 +5,7 @@ use composer_shared::observation::{Observation, SIZE};
 use composer_shared::policy::{CLIP, OUT};
 use composer_shared::robot::MAX_MODULES;
 
-use super::actor::{Actor, ActorLayout, ActorScratch, LATENT};
+use super::actor::{Actor, ActorLayout, ActorScratch, LATENT, Remembered, Shape};
 use crate::environment::View;
 use crate::network::Network;
 use crate::policy::Policy;
@@ -22,7 +22,7 @@ pub struct FloatPolicy {
 impl FloatPolicy {
     /// Of this network, which has been checked.
     pub fn new(network: &Network) -> Self {
-        let layout = ActorLayout::new(network.attention, OUT);
+        let layout = ActorLayout::new(Shape::of(network));
         let actor = Actor::new(layout, &layout.parameters(network));
         Self { actor, attention: network.attention, mean: network.mean, std: network.std }
     }
@@ -33,7 +33,8 @@ impl FloatPolicy {
             let z = (x - self.mean[i]) / self.std[i];
             if z.is_nan() { 0.0 } else { z.clamp(-CLIP, CLIP) }
         };
-        observations.iter().flat_map(|observation| observation.iter().enumerate().map(of)).collect()
+        let inputs = self.actor.layout().inputs();
+        observations.iter().flat_map(|observation| observation[..inputs].iter().enumerate().map(of)).collect()
     }
 
     /// The actions of all modules of one robot, yaw and pitch torque as a fraction of the limit, each within -1 to 1.
@@ -56,7 +57,7 @@ impl FloatPolicy {
         assert!(heard.len() == n && actions.len() == n, "one mask and one action for each of {n} modules");
         let heard: Vec<u64> = heard.iter().enumerate().map(|(module, heard)| heard | 1 << module).collect();
         let mut scratch = ActorScratch::default();
-        let means = self.actor.means(&self.normalised(observations), &heard, &[n], &mut scratch);
+        let means = self.actor.means(&self.normalised(observations), &heard, &[n], Remembered::default(), &mut scratch);
         for (action, mean) in actions.iter_mut().zip(means.as_chunks::<OUT>().0) {
             *action = mean.map(|torque| torque.clamp(-1.0, 1.0));
         }
@@ -78,7 +79,7 @@ impl FloatPolicy {
         let mut scratch = ActorScratch::default();
         let (n, normalised) = (observations.len(), self.normalised(observations));
         // Whom they hear does not matter to what they say.
-        self.actor.means(&normalised, &vec![u64::MAX; n], &vec![1; n], &mut scratch);
+        self.actor.means(&normalised, &vec![u64::MAX; n], &vec![1; n], Remembered::default(), &mut scratch);
         scratch.latent.as_chunks::<LATENT>().0[..n].to_vec()
     }
 }
@@ -202,7 +203,7 @@ mod tests {
     fn parameters_and_network_are_the_same_numbers() {
         for attention in [true, false] {
             let network = random_network(5, attention);
-            let layout = ActorLayout::new(attention, OUT);
+            let layout = ActorLayout::new(Shape::of(&network));
             let parameters = layout.parameters(&network);
             let back = layout.network(&parameters, network.mean, network.std);
             assert_eq!((back.encoder, back.hidden, back.output), (network.encoder, network.hidden, network.output));

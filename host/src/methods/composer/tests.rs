@@ -2,6 +2,7 @@
 
 use rand::RngExt;
 
+use super::actor::{MEMORY, distance_bucket};
 use super::float::FloatPolicy;
 use super::*;
 use crate::environment::{Drift, Environment, Lesson, PRIVILEGED, Told, Trivial, View};
@@ -11,7 +12,7 @@ use crate::methods::normalise::{Frozen, Running};
 use crate::methods::on_policy::buffer::gather;
 use crate::methods::on_policy::update::{adapted, all_samples};
 use crate::methods::on_policy::{
-    Decisions, Iteration, RolloutBuffer, RolloutWorker, Trajectory, Workspace, collect, update,
+    Decisions, Iteration, RolloutBuffer, RolloutWorker, Trajectory, Widths, Workspace, collect, update,
 };
 use crate::methods::parameters::Block;
 use crate::methods::random::stream;
@@ -29,10 +30,22 @@ struct Rollout {
     buffer: RolloutBuffer,
 }
 
+/// The paper's shape of a method's actor, and that of one with all that an actor can have.
+fn shapes(method: Method) -> Vec<Shape> {
+    let paper = Shape::paper(method.attention(), ACTIONS);
+    let all = Shape { inputs: SIZE, memory: MEMORY, distance_bias: method.attention(), ..paper };
+    vec![paper, all]
+}
+
 fn rollout(method: Method) -> Rollout {
-    let networks = |attention, outputs| Networks::new(attention, outputs, Differentiation::Manual);
-    let mut control = networks(method.attention(), ACTIONS).learner(5, 0.45, 1.0, 1e-5, 1e-3);
-    let mut imagination = networks(false, DISPLACEMENT).learner(6, 0.45, 1.0, 1e-5, 1e-3);
+    rollout_of(shapes(method)[0])
+}
+
+fn rollout_of(shape: Shape) -> Rollout {
+    let networks = |shape| Networks::new(shape, Differentiation::Manual);
+    let mut control = networks(shape).learner(5, 0.45, 1.0, 1e-5, 1e-3);
+    let imagines = Shape { inputs: shape.inputs, ..Shape::paper(false, DISPLACEMENT) };
+    let mut imagination = networks(imagines).learner(6, 0.45, 1.0, 1e-5, 1e-3);
     let mut rng = stream(9, Stream::Weights, 7, 7);
     for learner in [&mut control, &mut imagination] {
         learner.actor.iter_mut().chain(&mut learner.critic).for_each(|p| *p += 0.3 * (rng.random::<f32>() - 0.5));
@@ -44,10 +57,13 @@ fn rollout(method: Method) -> Rollout {
         Box::new(Trivial::new(3, Told::All)),
         Box::new(Trivial::new(5, Told::Head).with_dead(2)),
     ];
-    let mut workers: Vec<_> =
-        teams.into_iter().enumerate().map(|(i, team)| RolloutWorker::new(team, i, 5, 0.9, Lesson::default())).collect();
+    let mut workers: Vec<_> = teams
+        .into_iter()
+        .enumerate()
+        .map(|(i, team)| RolloutWorker::new(team, i, 5, 0.9, Widths::of(&control.networks), Lesson::default()))
+        .collect();
     let mut buffer = RolloutBuffer::new(3);
-    let (mut observations, mut privileged) = (Running::new(SIZE), Running::new(PRIVILEGED));
+    let (mut observations, mut privileged) = (Running::new(shape.inputs), Running::new(PRIVILEGED));
     let rules = Imagination { bound: 0.5, follow: 0.25 };
     let iteration = Iteration {
         policy: &control.networks,
@@ -108,12 +124,18 @@ fn batch_of(
 
 fn means(layout: ActorLayout, parameters: &[f32], batch: &Batch) -> Vec<f32> {
     let mut scratch = ActorScratch::default();
-    Actor::new(layout, parameters).means(&batch.observations, &batch.heard, &batch.modules, &mut scratch).to_vec()
+    let memory = Remembered { before: &batch.memory, follows: &batch.follows };
+    Actor::new(layout, parameters)
+        .means(&batch.observations, &batch.heard, &batch.modules, memory, &mut scratch)
+        .to_vec()
 }
 
 fn critic_values(parameters: &[f32], batch: &Batch) -> Vec<f32> {
     let mut scratch = CriticScratch::default();
-    Critic::new(parameters).values(&batch.observations, &batch.privileged, &batch.modules, &mut scratch).to_vec()
+    let layout = CriticLayout::new(batch.observations.len() / batch.rows());
+    Critic::new(layout, parameters)
+        .values(&batch.observations, &batch.privileged, &batch.modules, &mut scratch)
+        .to_vec()
 }
 
 fn actor_gradient(layout: ActorLayout, parameters: &[f32], batch: &Batch) -> Gradient {
@@ -128,7 +150,7 @@ fn actor_gradient(layout: ActorLayout, parameters: &[f32], batch: &Batch) -> Gra
 fn critic_gradient(parameters: &[f32], batch: &Batch, weight: f32) -> Gradient {
     let (mut sum, mut ordered) = (Gradient::default(), Vec::new());
     sum.clear(parameters.len());
-    let critic = Critic::new(parameters);
+    let critic = Critic::new(CriticLayout::new(batch.observations.len() / batch.rows()), parameters);
     critic.gradient(batch, weight, &mut CriticScratch::default(), &mut sum);
     critic.finish(&sum.gradient, false, &mut ordered);
     Gradient { gradient: ordered, ..sum }
@@ -158,9 +180,9 @@ fn ratio_is_one(name: &str, learner: &Learner, trajectories: &[Trajectory], deci
 
 #[test]
 fn ratio_is_one_on_the_first_minibatch_with_masks_and_padding() {
-    for method in Method::COMPOSERS {
-        let Rollout { control, imagination, buffer } = rollout(method);
-        ratio_is_one(method.name(), &control, &buffer.trajectories, &buffer.control);
+    for shape in Method::COMPOSERS.into_iter().flat_map(shapes) {
+        let Rollout { control, imagination, buffer } = rollout_of(shape);
+        ratio_is_one(&format!("{shape:?}"), &control, &buffer.trajectories, &buffer.control);
         ratio_is_one("imagination", &imagination, &buffer.trajectories, &buffer.companion);
     }
 }
@@ -268,13 +290,13 @@ fn clipped_loss(learner: &Learner, batch: &Batch) {
 
 #[test]
 fn the_gradient_of_the_clipped_loss_is_its_slope() {
-    // With attention and without.
-    for method in [Method::Composer, Method::ComposerNeither] {
+    // With attention and without, with memory and without.
+    for shape in [Method::Composer, Method::ComposerNeither].into_iter().flat_map(shapes) {
         let Rollout {
             control,
             imagination,
             buffer: RolloutBuffer { trajectories, control: mut of_control, companion: mut of_imagination },
-        } = rollout(method);
+        } = rollout_of(shape);
         clipped_loss(&control, &shaken(&trajectories, &mut of_control));
         clipped_loss(&imagination, &shaken(&trajectories, &mut of_imagination));
     }
@@ -290,7 +312,7 @@ fn critic() -> (Vec<f32>, Batch) {
 #[test]
 fn the_gradient_of_the_value_loss_is_its_slope() {
     let (critic, batch) = critic();
-    let layout = CriticLayout::default();
+    let layout = CriticLayout::new(batch.observations.len() / batch.rows());
     let loss = |parameters: &[f32]| -> f64 {
         let values = critic_values(parameters, &batch);
         values.iter().zip(&batch.targets).map(|(v, t)| 0.25 * f64::from(v - t).powi(2)).sum()
@@ -319,12 +341,12 @@ fn same(name: &str, manual: &Gradient, automatic: &Gradient, blocks: &[Block]) {
 
 #[test]
 fn gradients_by_hand_are_those_of_automatic_differentiation() {
-    for method in Method::COMPOSERS {
+    for shape in Method::COMPOSERS.into_iter().flat_map(shapes) {
         let Rollout {
             control,
             imagination,
             buffer: RolloutBuffer { trajectories, control: mut of_control, companion: mut of_imagination },
-        } = rollout(method);
+        } = rollout_of(shape);
         let batches = [
             (&control, shaken(&trajectories, &mut of_control)),
             (&imagination, shaken(&trajectories, &mut of_imagination)),
@@ -333,13 +355,49 @@ fn gradients_by_hand_are_those_of_automatic_differentiation() {
             let layout = *learner.networks.actor.layout();
             let automatic = layout.autodiff(&learner.actor, &batch, LOSS);
             let manual = actor_gradient(layout, &learner.actor, &batch);
-            same(method.name(), &manual, &automatic, &layout.blocks());
-            let layout = CriticLayout::default();
+            same(&format!("{shape:?}"), &manual, &automatic, &layout.blocks());
+            let layout = CriticLayout::new(batch.observations.len() / batch.rows());
             let automatic = layout.autodiff(&learner.critic, &batch, 0.01);
             let manual = critic_gradient(&learner.critic, &batch, 0.01);
             same("critic", &manual, &automatic, &layout.blocks());
         }
     }
+}
+
+#[test]
+fn what_is_remembered_goes_on_through_a_rollout_and_begins_anew_with_an_episode() {
+    let shape = shapes(Method::ComposerNoImagination)[1];
+    let Rollout { control, buffer: RolloutBuffer { trajectories, control: decisions, .. }, .. } = rollout_of(shape);
+    let layout = *control.networks.actor.layout();
+    for (trajectory, decisions) in trajectories.iter().zip(&decisions) {
+        let width = trajectory.modules * MEMORY;
+        let memory = |step: usize| &decisions.memory[step * width..(step + 1) * width];
+        for step in 0..16 {
+            // Episodes of a trivial team have ten steps.
+            let begins = step % Trivial::STEPS as usize == 0;
+            assert_eq!(memory(step).iter().all(|m| *m == 0.0), begins, "step {step}");
+        }
+    }
+    // Step by step from what was kept, or in one piece: the same to the last bit.
+    let (trajectory, decisions) = (&trajectories[..1], &decisions[..1]);
+    let whole = batch_of(trajectory, decisions, &all_samples(trajectory), 1.0, |r| r);
+    assert_eq!(whole.follows.iter().filter(|follows| !**follows).count(), 2);
+    let together = means(layout, &control.actor, &whole);
+    let outputs = ACTIONS * trajectory[0].modules;
+    for step in 0..16 {
+        let alone = batch_of(trajectory, decisions, &[(0, step)], 1.0, |r| r);
+        assert_eq!(alone.follows, [false]);
+        let at = step as usize * outputs;
+        assert_eq!(means(layout, &control.actor, &alone), together[at..at + outputs]);
+    }
+}
+
+#[test]
+fn distances_fall_into_thirteen_buckets() {
+    let of = |from, to| distance_bucket(from, to);
+    assert_eq!([0, 1, 2, 3, 4, 5, 8, 9, 16, 17, 63].map(|to| of(0, to)), [6, 7, 8, 9, 9, 10, 10, 11, 11, 12, 12]);
+    assert_eq!([1, 2, 4, 8, 16, 63].map(|from| of(from, 0)), [5, 4, 3, 2, 1, 0]);
+    assert_eq!(of(40, 40), 6);
 }
 
 #[test]
@@ -383,7 +441,7 @@ fn sigma_stays_above_its_least() {
 #[test]
 fn rescaling_the_critic_keeps_its_values() {
     let (mut critic, batch) = critic();
-    let layout = CriticLayout::default();
+    let layout = CriticLayout::new(batch.observations.len() / batch.rows());
     let before = critic_values(&critic, &batch);
     layout.rescale(&mut critic, [1.0, 2.0], [-3.0, 5.0]);
     let after = critic_values(&critic, &batch);
@@ -465,7 +523,8 @@ fn the_imagination_points_at_the_target_and_the_control_policy_follows() {
                 .iter()
                 .flat_map(|o| (0..SIZE).map(|i| ((o[i] - network.mean[i]) / network.std[i]).clamp(-5.0, 5.0)))
                 .collect();
-            let means = imagination.means(&normalised, &view.heard, &[3], &mut scratch).as_chunks().0;
+            let means =
+                imagination.means(&normalised, &view.heard, &[3], Remembered::default(), &mut scratch).as_chunks().0;
             let imagined: Vec<_> = (0..3).map(|m| env.place(m, displacement(means[m], bound))).collect();
             earned += env.imagined_reward(&imagined);
             let best = view.observations.iter().map(|o| o[0].hypot(o[1]).min(bound)).sum::<f32>() / 3.0;

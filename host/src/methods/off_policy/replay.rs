@@ -1,6 +1,6 @@
 //! The replay buffer: the latest transitions, drawn uniformly.
 
-use composer_shared::observation::SIZE;
+use composer_shared::observation::BASE;
 use rand::{Rng, RngExt};
 
 use crate::methods::on_policy::collect::ACTIONS;
@@ -11,7 +11,7 @@ use crate::methods::on_policy::collect::ACTIONS;
 pub struct Transitions {
     /// Modules of each team.
     pub modules: usize,
-    /// Observations, `[teams][module][SIZE]`.
+    /// Observations, `[teams][module][BASE]`.
     pub observations: Vec<f32>,
     /// Who heard whom, `[teams][module]`, own bit set.
     pub heard: Vec<u64>,
@@ -49,12 +49,12 @@ impl Transitions {
             }
         }
         let n = self.modules;
-        copy(&mut self.observations, &other.observations, n * SIZE, to, from);
+        copy(&mut self.observations, &other.observations, n * BASE, to, from);
         copy(&mut self.heard, &other.heard, n, to, from);
         copy(&mut self.actions, &other.actions, n * ACTIONS, to, from);
         copy(&mut self.rewards, &other.rewards, 1, to, from);
         copy(&mut self.done, &other.done, 1, to, from);
-        copy(&mut self.next_observations, &other.next_observations, n * SIZE, to, from);
+        copy(&mut self.next_observations, &other.next_observations, n * BASE, to, from);
         copy(&mut self.next_heard, &other.next_heard, n, to, from);
     }
 }
@@ -118,7 +118,7 @@ impl ReplayBuffer {
         let n = self.all.modules;
         let [len, next, rest @ ..] = numbers else { return false };
         let [len, next] = [len, next].map(|x| x.to_bits() as usize);
-        let each = 2 * n * SIZE + 4 * n + n * ACTIONS + 2;
+        let each = 2 * n * BASE + 4 * n + n * ACTIONS + 2;
         if len > self.capacity || next > len || len.checked_mul(each) != Some(rest.len()) {
             return false;
         }
@@ -132,12 +132,12 @@ impl ReplayBuffer {
             let of = |[low, high]: &[f32; 2]| u64::from(low.to_bits()) | u64::from(high.to_bits()) << 32;
             halves.as_chunks::<2>().0.iter().map(of).collect()
         };
-        self.all.observations = take(n * SIZE);
+        self.all.observations = take(n * BASE);
         self.all.heard = masks(take(2 * n));
         self.all.actions = take(n * ACTIONS);
         self.all.rewards = take(1);
         self.all.done = take(1);
-        self.all.next_observations = take(n * SIZE);
+        self.all.next_observations = take(n * BASE);
         self.all.next_heard = masks(take(2 * n));
         self.next = next % self.capacity;
         true
@@ -153,12 +153,12 @@ mod tests {
         let number = |i: usize| (from + i) as f32;
         Transitions {
             modules: 2,
-            observations: (0..count * 2 * SIZE).map(|i| number(i / (2 * SIZE))).collect(),
+            observations: (0..count * 2 * BASE).map(|i| number(i / (2 * BASE))).collect(),
             heard: vec![u64::MAX; 2 * count],
             actions: (0..count * 2 * ACTIONS).map(|i| number(i / (2 * ACTIONS))).collect(),
             rewards: (0..count).map(number).collect(),
             done: vec![0.0; count],
-            next_observations: (0..count * 2 * SIZE).map(|i| number(i / (2 * SIZE)) + 0.5).collect(),
+            next_observations: (0..count * 2 * BASE).map(|i| number(i / (2 * BASE)) + 0.5).collect(),
             next_heard: vec![1 << 40; 2 * count],
         }
     }
@@ -173,8 +173,8 @@ mod tests {
         let mut seen = [0; 7];
         for (i, reward) in drawn.rewards.iter().enumerate() {
             seen[*reward as usize] += 1;
-            assert!(drawn.observations[i * 2 * SIZE..(i + 1) * 2 * SIZE].iter().all(|o| o == reward));
-            assert!(drawn.next_observations[i * 2 * SIZE..(i + 1) * 2 * SIZE].iter().all(|o| *o == reward + 0.5));
+            assert!(drawn.observations[i * 2 * BASE..(i + 1) * 2 * BASE].iter().all(|o| o == reward));
+            assert!(drawn.next_observations[i * 2 * BASE..(i + 1) * 2 * BASE].iter().all(|o| *o == reward + 0.5));
             assert!(drawn.actions[i * 4..(i + 1) * 4].iter().all(|a| a == reward));
         }
         assert!(seen[..2] == [0, 0] && seen[2..].iter().all(|n| *n > 15), "{seen:?}");

@@ -5,15 +5,15 @@ use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
 use burn::tensor::Tensor;
-use composer_shared::observation::SIZE;
+use composer_shared::observation::BASE;
 use rand::{Rng, RngExt};
 
 use super::replay::{ReplayBuffer, Transitions};
 use crate::environment::{Environment, Lesson, Outcome};
 use crate::methods::config::TrainConfig;
-use crate::methods::on_policy::RolloutWorker;
 use crate::methods::on_policy::autodiff::{Seen, seen};
 use crate::methods::on_policy::collect::{ACTIONS, episode_seed};
+use crate::methods::on_policy::{RolloutWorker, Widths};
 use crate::methods::parameters::Adam;
 use crate::methods::random::{Stream, normal_noise, stream};
 use crate::methods::tensors::{Layout, Weights, floats, scalar};
@@ -21,6 +21,9 @@ use crate::methods::{
     Algorithm, EpisodeState, LearnerState, MakeEnvironment, Report, State, Times, TrainedPolicy, checked,
     episode_scalars,
 };
+
+/// The paper's observation; nobody remembers anything.
+const WIDTHS: Widths = Widths { inputs: BASE, memory: 0 };
 
 /// The networks of a deterministic method, as functions of their weights.
 pub trait DeterministicActorCritic: Clone + Send + Sync + 'static {
@@ -191,7 +194,14 @@ impl<N: DeterministicActorCritic> OffPolicy<N> {
         let mut environments = Vec::with_capacity(settings.environments);
         for index in 0..settings.environments {
             let environment = checked(make(index)?, index)?;
-            environments.push(RolloutWorker::new(environment, index, config.seed, settings.gamma, Lesson::default()));
+            environments.push(RolloutWorker::new(
+                environment,
+                index,
+                config.seed,
+                settings.gamma,
+                WIDTHS,
+                Lesson::default(),
+            ));
         }
         let modules = environments.first().context("there must be an environment")?.modules();
         if let Some(other) = environments.iter().find(|worker| worker.modules() != modules) {
@@ -359,8 +369,15 @@ impl<N: DeterministicActorCritic> Algorithm for OffPolicy<N> {
         for (index, EpisodeState { number, actions }) in state.episodes.iter().enumerate() {
             let (seed, gamma) = (self.config.seed, self.settings.gamma);
             let environment: Box<dyn Environment> = checked(make(index)?, index)?;
-            self.environments[index] =
-                RolloutWorker::restore(environment, index, seed, gamma, (*number, Lesson::default()), actions.clone());
+            self.environments[index] = RolloutWorker::restore(
+                environment,
+                index,
+                seed,
+                gamma,
+                WIDTHS,
+                (*number, Lesson::default()),
+                actions.clone(),
+            );
         }
         self.iteration = state.iteration;
         Ok(())
@@ -369,7 +386,7 @@ impl<N: DeterministicActorCritic> Algorithm for OffPolicy<N> {
 
 /// Observations of teams as a method without normalisation takes them.
 pub fn raw(view: &crate::environment::View) -> Vec<f32> {
-    let mut all = Vec::with_capacity(view.observations.len() * SIZE);
-    view.observations.iter().for_each(|observation| all.extend_from_slice(observation));
+    let mut all = Vec::with_capacity(view.observations.len() * BASE);
+    view.observations.iter().for_each(|observation| all.extend_from_slice(&observation[..BASE]));
     all
 }

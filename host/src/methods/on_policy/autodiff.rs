@@ -2,7 +2,7 @@
 //! [`ActorCritic`] is here. The place to begin for a new method.
 
 use burn::tensor::Tensor;
-use composer_shared::observation::SIZE;
+use composer_shared::observation::BASE;
 
 use super::losses::{ValueLoss, entropy, log_density, policy_loss, value_loss};
 use super::{ActorCritic, Batch, Gradient, LossSettings, Part, Ratio, Teams, Valued};
@@ -16,7 +16,7 @@ pub struct Seen {
     pub teams: usize,
     /// Modules of each.
     pub modules: usize,
-    /// Observations, `[teams * modules, SIZE]`.
+    /// Observations, `[teams * modules, BASE]`.
     pub observations: Tensor<2>,
     /// Added to the score that module i (second index) gives module j: 0, or -1e9 where it is not heard; `[teams, modules, modules]`.
     pub mask: Tensor<3>,
@@ -79,7 +79,7 @@ pub trait TensorNetworks: Clone + Send + Sync + 'static {
     fn log_sigma(&self, actor: &[f32]) -> Vec<f32>;
 
     /// What evaluation runs.
-    fn policy(&self, parameters: &[f32], mean: [f32; SIZE], std: [f32; SIZE]) -> TrainedPolicy;
+    fn policy(&self, parameters: &[f32], mean: &[f32], std: &[f32]) -> TrainedPolicy;
 }
 
 /// An [`ActorCritic`] out of [`TensorNetworks`].
@@ -135,7 +135,7 @@ pub fn seen(weights: &Weights, observations: &[f32], heard: &[u64], modules: usi
     Seen {
         teams,
         modules,
-        observations: weights.tensor(observations, [heard.len(), SIZE]),
+        observations: weights.tensor(observations, [heard.len(), BASE]),
         mask: weights.tensor(&mask, [teams, modules, modules]),
     }
 }
@@ -198,7 +198,7 @@ impl<N: TensorNetworks> ActorCritic for Autodiff<N> {
     ) {
         let outputs = self.outputs();
         for (modules, rows, _) in runs(teams.modules) {
-            let observations = &teams.observations[rows.start * SIZE..rows.end * SIZE];
+            let observations = &teams.observations[rows.start * BASE..rows.end * BASE];
             let seen = seen(&self.weights, observations, &teams.heard[rows.clone()], modules);
             let noise = &noise[rows.start * outputs..rows.end * outputs];
             let noise = self.weights.tensor(noise, [rows.len(), outputs]);
@@ -213,7 +213,7 @@ impl<N: TensorNetworks> ActorCritic for Autodiff<N> {
 
     fn values(&self, teams: Teams, _scratch: &mut (), values: &mut Vec<f32>) {
         for (modules, rows, _) in runs(teams.modules) {
-            let observations = &teams.observations[rows.start * SIZE..rows.end * SIZE];
+            let observations = &teams.observations[rows.start * BASE..rows.end * BASE];
             let seen = seen(&self.weights, observations, &teams.heard[rows], modules);
             values.extend(floats(self.networks.values(&self.weights, &seen)));
         }
@@ -272,7 +272,7 @@ impl<N: TensorNetworks> ActorCritic for Autodiff<N> {
         }
     }
 
-    fn policy(&self, mean: [f32; SIZE], std: [f32; SIZE]) -> TrainedPolicy {
+    fn policy(&self, mean: &[f32], std: &[f32]) -> TrainedPolicy {
         self.networks.policy(&self.parameters, mean, std)
     }
 }

@@ -3,8 +3,6 @@
 
 use std::ops::Range;
 
-use composer_shared::observation::SIZE;
-
 use super::Valued;
 use crate::environment::{Outcome, PRIVILEGED};
 
@@ -36,7 +34,7 @@ impl RolloutBuffer {
 pub struct Trajectory {
     /// Modules of this environment.
     pub modules: usize,
-    /// Normalised observations `[step][module][SIZE]`.
+    /// Normalised observations `[step][module][inputs]`.
     pub observations: Vec<f32>,
     /// Normalised privileged numbers `[step][module][PRIVILEGED]`.
     pub privileged: Vec<f32>,
@@ -70,6 +68,8 @@ pub struct Decisions {
     pub actions: Vec<f32>,
     /// Logarithm of their density `[step][module]`, or `[step][module][outputs]` where each action has a ratio of its own.
     pub log_probabilities: Vec<f32>,
+    /// What the modules remembered before each step `[step][module][memory]`; empty for a policy that does not.
+    pub memory: Vec<f32>,
     /// What the policy got for each step.
     pub rewards: Vec<f32>,
     /// What the critic said of each step on its own scale, `[step]` or `[step][module]`, as the advantages and returns.
@@ -114,6 +114,7 @@ impl Decisions {
     pub fn clear(&mut self) {
         self.actions.clear();
         self.log_probabilities.clear();
+        self.memory.clear();
         self.rewards.clear();
         self.values.clear();
         self.advantages.clear();
@@ -167,12 +168,16 @@ impl Decisions {
 pub struct Batch {
     /// Modules of each sample.
     pub modules: Vec<usize>,
-    /// Normalised observations, `[rows, SIZE]`.
+    /// Normalised observations, `[rows, inputs]`.
     pub observations: Vec<f32>,
     /// Normalised privileged numbers, `[rows, PRIVILEGED]`.
     pub privileged: Vec<f32>,
     /// Who hears whom, one mask a row, own bit set; bit i stands for module i of the sample.
     pub heard: Vec<u64>,
+    /// What each module remembered before, `[rows, memory]`, as it was in the rollout; empty for a policy that does not.
+    pub memory: Vec<f32>,
+    /// Whether the sample follows the one before it in the same episode, so that what it remembers comes from there.
+    pub follows: Vec<bool>,
     /// Weight of each row in the actor's loss: 0 for dead modules.
     pub weights: Vec<f32>,
     /// Actions taken, `[rows, outputs]`.
@@ -208,10 +213,12 @@ impl Batch {
         let valued = if of_rows { rows.clone() } else { samples.clone() };
         let valued = |numbers: &[f32]| numbers[valued.clone()].to_vec();
         Batch {
-            modules: self.modules[samples].to_vec(),
+            modules: self.modules[samples.clone()].to_vec(),
             observations: of(&self.observations),
             privileged: of(&self.privileged),
             heard: self.heard[rows.clone()].to_vec(),
+            memory: of(&self.memory),
+            follows: self.follows[samples.clone()].to_vec(),
             weights: of(&self.weights),
             actions: of(&self.actions),
             log_probabilities: of(&self.log_probabilities),
@@ -223,10 +230,13 @@ impl Batch {
 
     /// Empties the batch and keeps its memory.
     pub fn clear(&mut self) {
-        let Self { modules, heard, observations, privileged, weights, actions, log_probabilities, .. } = self;
+        let Self {
+            modules, heard, observations, privileged, memory, follows, weights, actions, log_probabilities, ..
+        } = self;
         modules.clear();
         heard.clear();
-        for numbers in [observations, privileged, weights, actions, log_probabilities] {
+        follows.clear();
+        for numbers in [observations, privileged, memory, weights, actions, log_probabilities] {
             numbers.clear();
         }
         for numbers in [&mut self.advantages, &mut self.targets, &mut self.values] {
@@ -248,6 +258,7 @@ pub fn gather(
     batch: &mut Batch,
 ) {
     batch.clear();
+    let mut last = None;
     for (index, step) in samples {
         let (trajectory, decisions) = (&trajectories[*index as usize], &decisions[*index as usize]);
         let (n, step) = (trajectory.modules, *step as usize);
@@ -257,7 +268,11 @@ pub fn gather(
             step * width..(step + 1) * width
         };
         batch.modules.push(n);
-        batch.observations.extend_from_slice(&trajectory.observations[at.start * SIZE..at.end * SIZE]);
+        batch.observations.extend_from_slice(&trajectory.observations[part(&trajectory.observations)]);
+        batch.memory.extend_from_slice(&decisions.memory[part(&decisions.memory)]);
+        let ended = |step: usize| trajectory.terminated[step] || trajectory.truncated[step];
+        batch.follows.push(step > 0 && last == Some((*index, step - 1)) && !ended(step - 1));
+        last = Some((*index, step));
         batch.privileged.extend_from_slice(&trajectory.privileged[at.start * PRIVILEGED..at.end * PRIVILEGED]);
         batch.heard.extend_from_slice(&trajectory.heard[at.clone()]);
         batch.weights.extend(trajectory.acts[at].iter().map(|acts| if *acts { weight } else { 0.0 }));
@@ -275,6 +290,8 @@ pub fn gather(
 
 #[cfg(test)]
 mod tests {
+    use composer_shared::observation::BASE;
+
     use super::*;
 
     #[test]
@@ -320,7 +337,7 @@ mod tests {
         let trajectory = |modules: usize| Trajectory {
             modules,
             rewards: vec![0.0; 2],
-            observations: (0..2 * modules * SIZE).map(|i| i as f32).collect(),
+            observations: (0..2 * modules * BASE).map(|i| i as f32).collect(),
             privileged: (0..2 * modules * PRIVILEGED).map(|i| -(i as f32)).collect(),
             heard: (0..2 * modules as u64).collect(),
             acts: (0..2 * modules).map(|i| i != 1).collect(),
@@ -345,8 +362,8 @@ mod tests {
         assert_eq!(batch.advantages, [1.0, 2.0]);
         assert_eq!(batch.log_probabilities, [0.0, 1.0, 3.0, 4.0, 5.0]);
         assert_eq!(batch.actions[2..6], [1.0, 0.5, 3.0, 0.5]);
-        assert_eq!(batch.observations.len(), 5 * SIZE);
-        assert_eq!(batch.observations[2 * SIZE], (3 * SIZE) as f32);
+        assert_eq!(batch.observations.len(), 5 * BASE);
+        assert_eq!(batch.observations[2 * BASE], (3 * BASE) as f32);
         assert_eq!(batch.privileged[2 * PRIVILEGED + 1], -((3 * PRIVILEGED + 1) as f32));
     }
 
@@ -359,7 +376,7 @@ mod tests {
             rewards,
             terminated: vec![false; 2],
             truncated: vec![false; 2],
-            observations: vec![0.0; 4 * SIZE],
+            observations: vec![0.0; 4 * BASE],
             privileged: vec![0.0; 4 * PRIVILEGED],
             heard: vec![3; 4],
             acts: vec![true; 4],

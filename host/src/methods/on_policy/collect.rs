@@ -4,11 +4,10 @@
 
 use std::time::{Duration, Instant};
 
-use composer_shared::observation::SIZE;
 use rand_chacha::ChaCha8Rng;
 
 use super::buffer::{Decisions, RolloutBuffer, Trajectory};
-use super::{ActorCritic, Teams};
+use super::{ActorCritic, Drawn, Teams};
 use crate::environment::{Environment, Lesson, PRIVILEGED, View};
 use crate::methods::normalise::{Frozen, Running};
 use crate::methods::random::{Stream, derive_seed, normal_noise, stream};
@@ -17,6 +16,22 @@ use crate::tasks::Point;
 
 /// Actions of a module under a control policy: yaw and pitch torque as a fraction of the limit.
 pub const ACTIONS: usize = 2;
+
+/// Numbers a module has in a rollout.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Widths {
+    /// Numbers of an observation that the policy takes.
+    pub inputs: usize,
+    /// Numbers that it remembers.
+    pub memory: usize,
+}
+
+impl Widths {
+    /// Those of a control policy.
+    pub fn of(policy: &impl ActorCritic) -> Self {
+        Self { inputs: policy.inputs(), memory: policy.memory() }
+    }
+}
 
 /// An environment, where it is in its sequence of episodes, and how it got there.
 pub struct RolloutWorker {
@@ -29,6 +44,8 @@ pub struct RolloutWorker {
     pub lesson: Lesson,
     /// Actions since its reset, all modules of a step together.
     pub actions: Vec<[f32; ACTIONS]>,
+    /// What its modules remember, `[module][memory]`; zeros at the start of an episode.
+    pub memory: Vec<f32>,
     pub(crate) view: View,
     observations: Running,
     privileged: Running,
@@ -40,16 +57,24 @@ pub struct RolloutWorker {
 
 impl RolloutWorker {
     /// Starts the first episode of the environment `index` of a run.
-    pub fn new(environment: Box<dyn Environment>, index: usize, run_seed: u64, gamma: f32, lesson: Lesson) -> Self {
-        Self::restore(environment, index, run_seed, gamma, (0, lesson), Vec::new())
+    pub fn new(
+        environment: Box<dyn Environment>,
+        index: usize,
+        run_seed: u64,
+        gamma: f32,
+        widths: Widths,
+        lesson: Lesson,
+    ) -> Self {
+        Self::restore(environment, index, run_seed, gamma, widths, (0, lesson), Vec::new())
     }
 
-    /// Brings an environment back to where it was: starts its episode again and replays the actions.
+    /// Brings an environment back to where it was: starts its episode again and replays the actions. What its modules remember is not brought back.
     pub fn restore(
         mut environment: Box<dyn Environment>,
         index: usize,
         run_seed: u64,
         gamma: f32,
+        widths: Widths,
         (episode, lesson): (u64, Lesson),
         actions: Vec<[f32; ACTIONS]>,
     ) -> Self {
@@ -69,8 +94,9 @@ impl RolloutWorker {
             episode,
             lesson,
             actions,
+            memory: vec![0.0; modules * widths.memory],
             view,
-            observations: Running::new(SIZE),
+            observations: Running::new(widths.inputs),
             privileged: Running::new(PRIVILEGED),
             gamma,
             discounted,
@@ -114,11 +140,11 @@ pub struct Iteration<'a, C> {
     /// The policy beside it with the seed of its random streams, if the method has one.
     pub companion: Option<(&'a C, u64, &'a dyn Companion)>,
     /// Statistics of the observations.
-    pub observations: Frozen<SIZE>,
+    pub observations: Frozen,
     /// Statistics of the privileged numbers.
-    pub privileged: Frozen<PRIVILEGED>,
+    pub privileged: Frozen,
     /// Statistics of the running discounted sums of rewards, if rewards are divided by their standard deviation.
-    pub rewards: Option<Frozen<1>>,
+    pub rewards: Option<Frozen>,
     /// Seed of the run.
     pub run_seed: u64,
     /// What the episodes that begin in it are to be like.
@@ -159,7 +185,8 @@ pub fn collect<C: ActorCritic>(
     });
     // In the order of the environments, so that rounding does not depend on the threads.
     for environment in environments {
-        observations.merge(&std::mem::replace(&mut environment.observations, Running::new(SIZE)));
+        let inputs = iteration.policy.inputs();
+        observations.merge(&std::mem::replace(&mut environment.observations, Running::new(inputs)));
         privileged.merge(&std::mem::replace(&mut environment.privileged, Running::new(PRIVILEGED)));
         returns.merge(&std::mem::replace(&mut environment.returns, Running::new(1)));
     }
@@ -177,9 +204,10 @@ struct Exchange {
     observations: Vec<f32>,
     heard: Vec<u64>,
     modules: Vec<usize>,
+    /// What the modules remember, `[rows, memory]`, for a policy that does.
+    memory: Vec<f32>,
     noise: Vec<f32>,
-    actions: Vec<f32>,
-    log_probabilities: Vec<f32>,
+    drawn: Drawn,
 }
 
 impl Exchange {
@@ -191,16 +219,19 @@ impl Exchange {
         scratch: &mut C::Scratch,
         decisions: &mut [Decisions],
     ) {
-        let Self { observations, heard, modules, noise, actions, log_probabilities } = self;
+        let Self { observations, heard, modules, memory, noise, drawn } = self;
         noise.clear();
-        actions.clear();
-        log_probabilities.clear();
+        drawn.actions.clear();
+        drawn.log_probabilities.clear();
         for (rng, n) in rngs.iter_mut().zip(&*modules) {
             normal_noise(rng, *n, policy.outputs(), noise);
         }
         let teams = Teams { observations, privileged: &[], heard, modules };
-        policy.sample(teams, noise, scratch, actions, log_probabilities);
-        let (mut actions, mut log_probabilities) = (&actions[..], &log_probabilities[..]);
+        match policy.memory() {
+            0 => policy.sample(teams, noise, scratch, &mut drawn.actions, &mut drawn.log_probabilities),
+            _ => policy.sample_remembering(teams, memory, noise, scratch, drawn),
+        }
+        let (mut actions, mut log_probabilities) = (&drawn.actions[..], &drawn.log_probabilities[..]);
         let (of_actions, of_log) = (actions.len() / heard.len(), log_probabilities.len() / heard.len());
         for (decisions, n) in decisions.iter_mut().zip(modules) {
             let (own, rest) = actions.split_at(*n * of_actions);
@@ -262,7 +293,18 @@ fn run<C: ActorCritic>(
                 decisions.rewards.push(reward);
             }
         }
+        exchange.memory.clear();
+        for (worker, decisions) in group.iter().zip(&mut *control) {
+            decisions.memory.extend_from_slice(&worker.memory);
+            exchange.memory.extend_from_slice(&worker.memory);
+        }
         exchange.decide(iteration.policy, &mut rngs, scratch, control);
+        let mut remembered = &exchange.memory[..];
+        for worker in &mut *group {
+            let (own, rest) = remembered.split_at(worker.memory.len());
+            worker.memory.copy_from_slice(own);
+            remembered = rest;
+        }
         for (((worker, decisions), trajectory), plan) in
             group.iter_mut().zip(&mut *control).zip(&mut *trajectories).zip(&plans)
         {
@@ -275,7 +317,8 @@ fn run<C: ActorCritic>(
             physics += began.elapsed();
             worker.discounted = worker.gamma * worker.discounted + outcome.reward;
             worker.returns.push(&[worker.discounted]);
-            let mut reward = iteration.rewards.map_or(outcome.reward, |rewards| rewards.scaled(outcome.reward));
+            let mut reward =
+                iteration.rewards.as_ref().map_or(outcome.reward, |rewards| rewards.scaled(outcome.reward));
             if let Some((_, _, rules)) = iteration.companion {
                 let error = rules.error(&*worker.environment, &trajectory.acts[step * n..], plan);
                 trajectory.companion_errors.push(error);
@@ -295,6 +338,7 @@ fn run<C: ActorCritic>(
                 worker.episode += 1;
                 worker.actions.clear();
                 worker.discounted = 0.0;
+                worker.memory.fill(0.0);
                 worker.lesson = iteration.lesson;
                 worker.environment.teach(&worker.lesson);
                 worker.environment.reset(episode_seed(iteration.run_seed, worker.index, worker.episode));
@@ -314,7 +358,7 @@ fn run<C: ActorCritic>(
 }
 
 /// Appends a final view to a trajectory.
-fn finals<C>(trajectory: &mut Trajectory, view: &View, iteration: &Iteration<C>) {
+fn finals<C: ActorCritic>(trajectory: &mut Trajectory, view: &View, iteration: &Iteration<C>) {
     for (module, (observation, privileged)) in view.observations.iter().zip(&view.privileged).enumerate() {
         iteration.observations.apply(observation, &mut trajectory.final_observations);
         iteration.privileged.apply(privileged, &mut trajectory.final_privileged);

@@ -13,10 +13,10 @@ pub mod update;
 use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
-use composer_shared::observation::SIZE;
+use composer_shared::observation::BASE;
 
 pub use self::buffer::{Batch, Decisions, RolloutBuffer, Trajectory};
-pub use self::collect::{Companion, Iteration, RolloutWorker, collect};
+pub use self::collect::{Companion, Iteration, RolloutWorker, Widths, collect};
 pub use self::update::{Learner, OnPolicySettings, UpdateStats, Workspace, update};
 use super::config::TrainConfig;
 use super::curriculum::{Curriculum, CurriculumConfig};
@@ -47,7 +47,7 @@ pub enum Valued {
 /// What some teams see at one moment each. A row is one module; the rows of a team lie together, head first.
 #[derive(Clone, Copy, Debug)]
 pub struct Teams<'a> {
-    /// Normalised observations, `[rows, SIZE]`.
+    /// Normalised observations, `[rows, inputs]`.
     pub observations: &'a [f32],
     /// Normalised privileged numbers, `[rows, PRIVILEGED]`; empty where nobody values.
     pub privileged: &'a [f32],
@@ -55,6 +55,15 @@ pub struct Teams<'a> {
     pub heard: &'a [u64],
     /// Modules of each team.
     pub modules: &'a [usize],
+}
+
+/// What a policy draws for some teams, appended to what is there.
+#[derive(Clone, Debug, Default)]
+pub struct Drawn {
+    /// Actions, unclipped, `[rows, outputs]`.
+    pub actions: Vec<f32>,
+    /// Logarithm of their densities: one a row, or one an action where that is what the ratio is taken over.
+    pub log_probabilities: Vec<f32>,
 }
 
 /// A loss summed over a batch, its gradient, and what else is told about it.
@@ -118,8 +127,18 @@ pub trait ActorCritic: Send + Sync + 'static {
 
     /// Teams that go through the networks together, in rollouts: each group of so many environments goes in step.
     const TOGETHER: usize;
+    /// Numbers of an observation that it takes, the first.
+    fn inputs(&self) -> usize {
+        BASE
+    }
+
     /// Actions of a module.
     fn outputs(&self) -> usize;
+
+    /// Numbers that a module remembers from one step to the next.
+    fn memory(&self) -> usize {
+        0
+    }
 
     /// What the ratio is taken over.
     fn ratio(&self) -> Ratio;
@@ -146,6 +165,19 @@ pub trait ActorCritic: Send + Sync + 'static {
         actions: &mut Vec<f32>,
         log_probabilities: &mut Vec<f32>,
     );
+
+    /// The same of modules that remember: `memory`, `[rows, memory]`, is what they remembered before, and then what they do.
+    fn sample_remembering(
+        &self,
+        teams: Teams,
+        memory: &mut [f32],
+        noise: &[f32],
+        scratch: &mut Self::Scratch,
+        drawn: &mut Drawn,
+    ) {
+        let _ = memory;
+        self.sample(teams, noise, scratch, &mut drawn.actions, &mut drawn.log_probabilities);
+    }
 
     /// Appends the values on the critic's scale: one a team or one a row.
     fn values(&self, teams: Teams, scratch: &mut Self::Scratch, values: &mut Vec<f32>);
@@ -179,7 +211,7 @@ pub trait ActorCritic: Send + Sync + 'static {
     }
 
     /// The policy as it is, with the statistics of its observations: what evaluation runs.
-    fn policy(&self, mean: [f32; SIZE], std: [f32; SIZE]) -> TrainedPolicy;
+    fn policy(&self, mean: &[f32], std: &[f32]) -> TrainedPolicy;
 }
 
 /// A second policy that learns beside the control policy, from the same rollouts.
@@ -191,6 +223,9 @@ pub struct CompanionLearner<C> {
     /// Its update.
     pub settings: OnPolicySettings,
 }
+
+/// Observations that statistics from elsewhere stand for.
+const KNOWN: f64 = 1e6;
 
 /// An on-policy method between two iterations.
 pub struct OnPolicy<C: ActorCritic> {
@@ -224,10 +259,11 @@ impl<C: ActorCritic> OnPolicy<C> {
         let mut environments = Vec::with_capacity(settings.environments);
         for index in 0..settings.environments {
             let environment = checked(make(index)?, index)?;
-            environments.push(RolloutWorker::new(environment, index, config.seed, settings.gamma, lesson));
+            let widths = Widths::of(&control.networks);
+            environments.push(RolloutWorker::new(environment, index, config.seed, settings.gamma, widths, lesson));
         }
         Ok(Self {
-            observations: Running::new(SIZE),
+            observations: Running::new(control.networks.inputs()),
             privileged: Running::new(PRIVILEGED),
             returns: Running::new(1),
             curriculum,
@@ -240,6 +276,11 @@ impl<C: ActorCritic> OnPolicy<C> {
             control,
             companion,
         })
+    }
+
+    /// Normalises observations by these statistics from now on, which change slowly.
+    pub fn know(&mut self, mean: &[f32], std: &[f32]) {
+        self.observations = Running::known(mean, std, KNOWN);
     }
 
     /// The control policy and its critic as they are now.
@@ -257,8 +298,9 @@ impl<C: ActorCritic> OnPolicy<C> {
         let returns = self.settings.reward_clip.map(|_| self.returns.numbers());
         let lessons = || self.environments.iter().flat_map(|worker| worker.lesson.numbers());
         let curriculum = self.curriculum.iter().flat_map(|curriculum| curriculum.numbers().chain(lessons()));
+        let memories = self.environments.iter().flat_map(|worker| worker.memory.iter().map(|m| f64::from(*m)));
         let numbers = self.observations.numbers().chain(self.privileged.numbers());
-        numbers.chain(returns.into_iter().flatten()).chain(curriculum).collect()
+        numbers.chain(returns.into_iter().flatten()).chain(curriculum).chain(memories).collect()
     }
 
     fn learners(&self) -> impl Iterator<Item = &Learner<C>> {
@@ -279,7 +321,7 @@ impl<C: ActorCritic> Algorithm for OnPolicy<C> {
             companion: self.companion.as_ref().map(|c| (&c.learner.networks, c.learner.seed, &*c.rules)),
             observations: match self.settings.observation_clip {
                 Some(clip) => Frozen::with_clip(&self.observations, clip),
-                None => Frozen::off(),
+                None => Frozen::off(self.control.networks.inputs()),
             },
             privileged: Frozen::new(&self.privileged),
             rewards: self.settings.reward_clip.map(|clip| Frozen::with_clip(&self.returns, clip)),
@@ -360,7 +402,7 @@ impl<C: ActorCritic> Algorithm for OnPolicy<C> {
     }
 
     fn policy(&self) -> TrainedPolicy {
-        self.control.networks.policy(self.observations.mean(), self.observations.std())
+        self.control.networks.policy(&self.observations.mean(), &self.observations.std())
     }
 
     fn iteration(&self) -> u64 {
@@ -395,8 +437,11 @@ impl<C: ActorCritic> Algorithm for OnPolicy<C> {
             learner.restore(state)?;
         }
         let mut numbers = state.statistics.iter().copied();
-        let statistics =
-            (|| Some((Running::from_numbers(SIZE, &mut numbers)?, Running::from_numbers(PRIVILEGED, &mut numbers)?)))();
+        let widths = Widths::of(&self.control.networks);
+        let inputs = widths.inputs;
+        let statistics = (|| {
+            Some((Running::from_numbers(inputs, &mut numbers)?, Running::from_numbers(PRIVILEGED, &mut numbers)?))
+        })();
         let Some((observations, privileged)) = statistics else {
             bail!("the checkpoint has too few statistics: it is of another version");
         };
@@ -434,9 +479,16 @@ impl<C: ActorCritic> Algorithm for OnPolicy<C> {
                 index,
                 self.config.seed,
                 self.settings.gamma,
+                widths,
                 (*number, lessons[index]),
                 actions.clone(),
             );
+        }
+        for memory in self.environments.iter_mut().flat_map(|worker| &mut worker.memory) {
+            let Some(number) = numbers.next() else {
+                bail!("the checkpoint has too few statistics: it is of another version");
+            };
+            *memory = number as f32;
         }
         self.iteration = state.iteration;
         Ok(())

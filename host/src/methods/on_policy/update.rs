@@ -2,8 +2,8 @@
 //!
 //! Sums are taken over chunks of fixed size in a fixed order, so the result does not depend on the number of threads.
 
-use composer_shared::observation::SIZE;
 use rand::RngExt;
+use rand_chacha::ChaCha8Rng;
 
 use super::buffer::{Batch, Decisions, Trajectory, gather};
 use super::{ActorCritic, Gradient, LossSettings, Part, Teams};
@@ -15,6 +15,8 @@ use crate::methods::workers::Workers;
 
 /// Samples (steps of one environment) that one thread takes at a time.
 const CHUNK: usize = 64;
+/// Steps that go through a memory in one piece; what they remembered before is as it was in the rollout.
+pub const STRETCH: usize = 16;
 /// The adaptive learning rate changes by this factor and stays within these limits (as in rsl_rl).
 const RATE_FACTOR: f32 = 1.5;
 /// Limits of the adaptive learning rate.
@@ -225,7 +227,7 @@ pub(crate) fn all_samples(trajectories: &[Trajectory]) -> Vec<(u32, u32)> {
     trajectories.iter().enumerate().flat_map(of).collect()
 }
 
-/// What the critic says, on its own scale, of views of teams of `modules` modules: `[view][module][SIZE]` and
+/// What the critic says, on its own scale, of views of teams of `modules` modules: `[view][module][inputs]` and
 /// `[view][module][PRIVILEGED]`.
 fn values<C: ActorCritic>(
     networks: &C,
@@ -237,7 +239,7 @@ fn values<C: ActorCritic>(
     let mut values = Vec::with_capacity(heard.len());
     let block = networks.block();
     let blocks = observations
-        .chunks(block * modules * SIZE)
+        .chunks(block * modules * networks.inputs())
         .zip(privileged.chunks(block * modules * PRIVILEGED))
         .zip(heard.chunks(block * modules));
     for ((observations, privileged), heard) in blocks {
@@ -330,6 +332,8 @@ fn update_within<C: ActorCritic>(
     let decisions = &*decisions;
     let valued = learner.networks.valued();
     let mut samples = all_samples(trajectories);
+    // Those of each trajectory.
+    let in_order: Vec<Vec<(u32, u32)>> = samples.chunk_by(|a, b| a.0 == b.0).map(<[_]>::to_vec).collect();
     let size = samples.len().div_ceil(settings.minibatches).max(1);
     let chunk_count = size.div_ceil(CHUNK);
     let Workspace { workers, scratch, actor: actor_sums, critic: critic_sums } = workspace;
@@ -341,8 +345,13 @@ fn update_within<C: ActorCritic>(
     let of_critic_len = learner.critic.len();
     for epoch in 0..settings.epochs.max(settings.critic_epochs) {
         let mut rng = stream(learner.seed, Stream::Shuffle, iteration, epoch as u64);
-        for i in (1..samples.len()).rev() {
-            samples.swap(i, rng.random_range(0..=i));
+        if learner.networks.memory() == 0 {
+            shuffle(&mut samples, &mut rng);
+        } else {
+            // Stretches of steps that follow each other, in any order: the gradient goes back through what is remembered within them.
+            let mut stretches: Vec<&[(u32, u32)]> = in_order.iter().flat_map(|steps| steps.chunks(STRETCH)).collect();
+            shuffle(&mut stretches, &mut rng);
+            samples = stretches.concat();
         }
         for minibatch in samples.chunks(size) {
             let with_actor = learning && epoch < settings.epochs;
@@ -457,6 +466,13 @@ fn update_within<C: ActorCritic>(
     let log_sigma = learner.networks.log_sigma();
     stats.entropy = log_sigma.iter().map(|l| f64::from(*l) + 1.418_938_533_204_672_7).sum();
     stats
+}
+
+/// Fisher and Yates's.
+fn shuffle<T>(list: &mut [T], rng: &mut ChaCha8Rng) {
+    for i in (1..list.len()).rev() {
+        list.swap(i, rng.random_range(0..=i));
+    }
 }
 
 /// Adds all up in the first, in order.
