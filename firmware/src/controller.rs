@@ -54,7 +54,7 @@ use composer_shared::robot::{AXES, Limits, ROOM};
 use composer_shared::wire::{
     Clearing, EmergencyStop, FRAGMENTS, Frame, Goal, Health, Heartbeat, LatentMessage, Message, Mode, NOBODY,
     Operation, PROTOCOL_VERSION, STATION, ServiceCode, ServiceRequest, ServiceResponse, State, StopCommand, StopCount,
-    Sync, Telemetry, quantise_angle,
+    StopLatch, Sync, Telemetry, quantise_angle,
 };
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
@@ -645,6 +645,16 @@ impl<'a> Controller<'a> {
     /// Releases the whole robot from here; the others are told by the counter in STATE. The module stays disarmed.
     pub fn release(&mut self) {
         self.failsafe.command_stop(StopCommand::Release, StopCount::UNKNOWN);
+    }
+
+    /// Follows a stop that an interrupt took while the controller computed ([`crate::torque_off`]), before the next poll. The frame that brought it may still come.
+    pub fn follow_stop(&mut self, latch: StopLatch) {
+        self.failsafe.follow(latch);
+    }
+
+    /// The emergency stop as the controller knows it.
+    pub fn stop_latch(&self) -> StopLatch {
+        self.failsafe.stop()
     }
 
     /// Allows the motors to be driven; `acknowledge`: even after a reset that was not clean. The error is [`ServiceCode::NotArmable`].

@@ -12,13 +12,14 @@ use composer_shared::wire::Frame;
 use nalgebra::{Matrix3, Vector3};
 
 use crate::boot::{Boot, ResetCause};
-use crate::controller::{BusStatus, Config, ConfigError, Controller, Micros, Outputs};
+use crate::controller::{BusKind, BusStatus, Config, ConfigError, Controller, Micros, Outputs};
 use crate::drivers::encoder::{JointCalibration, STEPS};
 use crate::node_page::{Calibration, NodePage};
 use crate::port::PortStatus;
 use crate::safety::Safety;
 use crate::service::{Board, Raw, Service};
 use crate::storage::{RamFlash, read_page};
+use crate::torque_off::{Interrupt, TorqueOff};
 
 /// Bytes of an emulated flash.
 const FLASH_SIZE: usize = 4 * 256;
@@ -147,6 +148,7 @@ pub struct Emulated<'a> {
     pages: [Option<NodePage>; 2],
     controller: Option<Controller<'a>>,
     service: Option<Service>,
+    torque_off: TorqueOff,
 }
 
 /// Flash that is memory takes no time: what is on its way gets there at once.
@@ -175,7 +177,15 @@ fn first_page(config: &Config, mounted: Calibration) -> NodePage {
 impl<'a> Emulated<'a> {
     /// A module that is off.
     pub fn new(policy: Policy<'a>) -> Self {
-        Emulated { policy, hardware: Hardware::OFF, config: None, pages: [None; 2], controller: None, service: None }
+        Emulated {
+            policy,
+            hardware: Hardware::OFF,
+            config: None,
+            pages: [None; 2],
+            controller: None,
+            service: None,
+            torque_off: TorqueOff::new(),
+        }
     }
 
     /// It starts, for this reason, with new flash, its hardware mounted like this, and a page that says so.
@@ -217,6 +227,7 @@ impl<'a> Emulated<'a> {
         // First make room: two controllers are too much for the stack of an emulated module.
         (self.controller, self.service) = (None, None);
         let controller = self.controller.insert(Controller::new(config, self.policy, boot, now)?);
+        self.torque_off.restart(controller.stop_latch());
         let service = self.service.insert(Service::new(page, controller, now, &mut self.hardware));
         settle(service, controller, &mut self.hardware);
         Ok(())
@@ -242,6 +253,20 @@ impl<'a> Emulated<'a> {
         self.service.as_ref()
     }
 
+    /// Something interrupts whatever the module computes. Returns whether its motors coast from now on ([`crate::torque_off::WITHIN_US`] later), and what it tells the others
+    /// at once.
+    pub fn interrupt(&mut self, interrupt: Interrupt<'_>) -> (bool, Option<Frame>) {
+        let Some(config) = self.controller.as_ref().map(Controller::config) else { return (true, None) };
+        let told = match interrupt {
+            Interrupt::Frame(frame) => {
+                self.torque_off.hear(frame);
+                None
+            }
+            Interrupt::StopInput => self.torque_off.trip(config.node, config.bus == BusKind::Fd),
+        };
+        (self.torque_off.is_off(), told)
+    }
+
     /// Goes on to `now`: polls controller and service, and restarts if the station wants it. `truth` is what is true of the module; the torque that comes out is
     /// what its motors give.
     pub fn poll(&mut self, now: Micros, truth: &Sensors, received: Option<&Frame>, bus: BusStatus) -> Outputs {
@@ -262,8 +287,10 @@ impl<'a> Emulated<'a> {
             sensed = self.hardware.sensed(calibration);
             &sensed
         };
+        controller.follow_stop(self.torque_off.latch());
         let mut outputs = controller.poll(now, sensors, received, bus);
         service.poll(now, controller, sensors, received, &mut self.hardware);
+        self.torque_off.follow(controller.stop_latch());
         settle(service, controller, &mut self.hardware);
         outputs.deadline = outputs.deadline.min(service.deadline()).max(now.saturating_add(1));
         if *calibration != self.hardware.mounted {
@@ -282,7 +309,6 @@ impl<'a> Emulated<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::controller::BusKind;
     use composer_shared::policy::{IMAGE_SIZE, random_image};
     use composer_shared::registers::Register;
     use composer_shared::wire::{Message, Operation, STATION, ServiceCode, ServiceRequest};

@@ -315,6 +315,13 @@ impl Failsafe {
         }
     }
 
+    /// Takes what another latch of this robot says.
+    pub fn follow(&mut self, other: StopLatch) {
+        if self.stop.hear(other.stopped(), other.count()) {
+            self.follow_stop();
+        }
+    }
+
     fn follow_stop(&mut self) {
         self.faults.set(Fault::EmergencyStop, self.stop.stopped());
         self.armed &= !self.stop.stopped();

@@ -10,7 +10,7 @@
 //!
 //! [`neighbours`] keeps what was heard from the other modules and how fresh it is; [`failsafe`] decides when the motors relax
 //! and why, by what [`limits`], [`supply`] and [`trips`] say of joints, supply and motors, and within the settings of [`safety`]; [`port`] which
-//! frame is sent next. [`link`] is how an emulated module talks to the simulator.
+//! frame is sent next. A stop takes a shorter way to the motors, [`torque_off`]. [`link`] is how an emulated module talks to the simulator.
 
 #[cfg(test)]
 extern crate std;
@@ -36,4 +36,5 @@ pub mod service;
 pub mod stop_input;
 pub mod storage;
 pub mod supply;
+pub mod torque_off;
 pub mod trips;

@@ -22,6 +22,7 @@
 //! | `Poll`: so late is it, this the sensors read, this came | a `Frame` for each frame it sends, then `Answer` |
 //! | `Frames`: the CAN port has room again | a `Frame` for each, then `Sent` |
 //! | `Status` | `Status` |
+//! | `Interrupt`: a frame came or the stop input opened while it computed | a `Frame` if it tells the others at once, then `Interrupted` |
 //!
 //! The module never speaks unasked, but for `Hello` and, if it panics, `LastWords`. It has no time of its own: between two messages nothing
 //! happens in it. So what it answers depends on what it was told alone, and the simulator may let several modules work at once.
@@ -37,7 +38,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use crate::controller::{Boot, BusStatus, Config, FaultSet, Micros, Retained, Stats};
 
 /// Version of these messages. The first two numbers of the first message, 0 and this, stay what they are in every version.
-pub const PROTOCOL: u16 = 2;
+pub const PROTOCOL: u16 = 3;
 
 /// Most bytes of an encoded message, framing and the 0 at its end included.
 pub const MESSAGE_MAX: usize = 320;
@@ -87,6 +88,11 @@ pub enum ToModule {
     },
     /// What is it at?
     Status,
+    /// While it computes, its CAN controller received this frame; or, if there is none, its stop input opened ([`crate::torque_off`]).
+    Interrupt {
+        /// The frame; it comes with a `Poll` again.
+        frame: Option<Carried>,
+    },
 }
 
 /// What the module says.
@@ -122,6 +128,11 @@ pub enum FromModule<'a> {
     Sent,
     /// What it is at.
     Status(Status),
+    /// It took the interrupt.
+    Interrupted {
+        /// Whether its motors coast now.
+        off: bool,
+    },
     /// It panics; this is why. Nothing more will come.
     LastWords(&'a str),
 }

@@ -3,6 +3,7 @@
 use composer_firmware::controller::{Boot, BusStatus, Config, ConfigError, FaultSet, Micros, Outputs, Retained, Stats};
 use composer_firmware::emulated::Emulated;
 use composer_firmware::node_page::Calibration;
+use composer_firmware::torque_off::Interrupt;
 use composer_shared::observation::Sensors;
 use composer_shared::policy::Policy;
 use composer_shared::robot::MAX_MODULES;
@@ -80,6 +81,9 @@ pub trait Computer {
 
     /// The next frame to send; `room` of them fit.
     fn next_frame(&mut self, room: usize) -> Result<Option<Frame>, Trouble>;
+
+    /// Something interrupts what it computes. Whether its motors coast now, and what it tells the others at once.
+    fn interrupt(&mut self, interrupt: Interrupt<'_>) -> Result<(bool, Option<Frame>), Trouble>;
 
     /// Begins to look what the module is at.
     fn ask_status(&mut self) -> Result<(), Trouble>;
@@ -166,6 +170,10 @@ impl Computer for Local<'_> {
 
     fn next_frame(&mut self, _room: usize) -> Result<Option<Frame>, Trouble> {
         Ok(self.module.next_frame())
+    }
+
+    fn interrupt(&mut self, interrupt: Interrupt<'_>) -> Result<(bool, Option<Frame>), Trouble> {
+        Ok(self.module.interrupt(interrupt))
     }
 
     fn ask_status(&mut self) -> Result<(), Trouble> {

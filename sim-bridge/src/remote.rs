@@ -7,6 +7,7 @@ use composer_firmware::controller::{Boot, Config, Micros, Outputs};
 use composer_firmware::link::{
     self, BUILD, Carried, FromModule, LinkError, MESSAGE_MAX, PROTOCOL, Receiver, Sample, ToModule,
 };
+use composer_firmware::torque_off::Interrupt;
 use composer_shared::robot::AXES;
 use composer_shared::wire::{Frame, Mode};
 
@@ -77,6 +78,7 @@ enum Reply {
     Answer { torque: Option<[f32; AXES]>, motors_enabled: bool, deadline: Micros, acted: u32 },
     Sent,
     Status(Box<link::Status>),
+    Interrupted(bool),
 }
 
 /// A computer at the other end of a [`Line`].
@@ -182,6 +184,7 @@ impl<L: Line> Remote<L> {
             }
             Ok(FromModule::Sent) => Reply::Sent,
             Ok(FromModule::Status(status)) => Reply::Status(Box::new(status)),
+            Ok(FromModule::Interrupted { off }) => Reply::Interrupted(off),
             Ok(FromModule::Refused(reason)) => return Err(LinkTrouble::Refused(reason.into()).into()),
             Ok(FromModule::LastWords(words)) => return Err(self.crashed(words.into())),
             Ok(FromModule::Hello { .. }) => return Err(self.nonsense("it has started again by itself")),
@@ -257,6 +260,23 @@ impl<L: Line> Computer for Remote<L> {
             self.drained = count < self.asked;
         }
         Ok(self.frames.pop_front())
+    }
+
+    fn interrupt(&mut self, interrupt: Interrupt<'_>) -> Result<(bool, Option<Frame>), Trouble> {
+        self.ensure_started()?;
+        let frame = match interrupt {
+            Interrupt::Frame(frame) => Some(Carried(*frame)),
+            Interrupt::StopInput => None,
+        };
+        self.send(&ToModule::Interrupt { frame })?;
+        match self.reply()? {
+            Reply::Interrupted(off) => Ok((off, None)),
+            Reply::Frame(frame) => match self.reply()? {
+                Reply::Interrupted(off) => Ok((off, Some(frame))),
+                _ => Err(self.nonsense("it answers something else than it was asked")),
+            },
+            _ => Err(self.nonsense("it answers something else than it was asked")),
+        }
     }
 
     fn ask_status(&mut self) -> Result<(), Trouble> {

@@ -10,6 +10,7 @@
 //! - A torque that a controller has computed at time t acts from the first plant step that begins at t or later, never before.
 //! - Computing takes time: [`SilConfig::encode_latency_us`] from the last STATE needed until LATENT is ready to be sent,
 //!   [`SilConfig::act_latency_us`] from the last LATENT needed until the torque is at the motor. Meanwhile received frames wait.
+//!   A stop does not wait: it takes the torque by an interrupt, in [`WITHIN_US`] ([`composer_firmware::torque_off`]).
 //! - Modules and station send and receive through a [`Port`], which is the board's.
 //! - An unplugged module is gone: no controller, no torque from the next plant step on. Plugged in again, a fresh controller starts. One whose supply broke
 //!   in knows what it kept ([`Retained`]), and waits for somebody to acknowledge that.
@@ -35,6 +36,7 @@ use composer_firmware::controller::{
     Boot, BusKind, BusOffPolicy, BusStatus, Config, FaultSet, Micros, ResetCause, Retained, Stats, Timing,
 };
 use composer_firmware::port::CanPort;
+use composer_firmware::torque_off::{Interrupt, WITHIN_US};
 use composer_shared::observation::Sensors;
 use composer_shared::policy::Policy;
 use composer_shared::robot::{AXES, MAX_MODULES};
@@ -139,6 +141,7 @@ struct Engine<'c, L: Launcher> {
     next_change: usize,
     active: Vec<Fault>,
     next_command: usize,
+    next_press: usize,
     next_injected: usize,
     /// The first of the nodes that somebody outside plays.
     outside_node: usize,
@@ -251,6 +254,7 @@ impl<'c, L: Launcher> Engine<'c, L> {
             next_change: 0,
             active: Vec::new(),
             next_command: 0,
+            next_press: 0,
             next_injected: 0,
             outside_node,
             outside_waiting: VecDeque::new(),
@@ -356,11 +360,12 @@ impl<'c, L: Launcher> Engine<'c, L> {
     fn next_ns(&self) -> u64 {
         let change = self.changes.get(self.next_change).map_or(NEVER, |change| change.0);
         let command = self.config.commands.get(self.next_command).map_or(NEVER, |command| command.0);
+        let press = self.config.presses.get(self.next_press).map_or(NEVER, |press| press.0);
         let injected =
             self.config.injected.get(self.next_injected).filter(|_| self.bus.has_room(self.modules.len() + 1));
         let injected = injected.map_or(NEVER, |injected| injected.at_ns);
         let ports = self.modules.iter().fold(self.station_port.next_ns(), |next, state| next.min(state.port.next_ns()));
-        change.min(command).min(injected).min(self.next_poll_ns).min(ports).min(self.bus.next_event_ns())
+        change.min(command).min(press).min(injected).min(self.next_poll_ns).min(ports).min(self.bus.next_event_ns())
     }
 
     /// Starts and ends faults.
@@ -550,6 +555,41 @@ impl<'c, L: Launcher> Engine<'c, L> {
         }
     }
 
+    /// Opens the stop inputs of modules that are on.
+    fn press_stop_inputs(&mut self, now: u64) -> Result<(), SilError> {
+        while let Some(&(at, module)) = self.config.presses.get(self.next_press)
+            && at <= now
+        {
+            self.next_press += 1;
+            if module < self.modules.len() {
+                self.interrupt(module, Interrupt::StopInput, now)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Interrupts what a module computes. If its motors coast from then on, no torque that is on its way gets to them.
+    fn interrupt(&mut self, module: usize, interrupt: Interrupt<'_>, now: u64) -> Result<(), SilError> {
+        let node = self.node(module);
+        let state = &mut self.modules[module];
+        let Some(controller) = &mut state.controller else { return Ok(()) };
+        let (off, told) = match controller.interrupt(interrupt) {
+            Ok(done) => done,
+            Err(trouble) => return self.lose(module, now, trouble),
+        };
+        if off {
+            let at = now + 1000 * WITHIN_US;
+            state.coming.retain(|(ready, _)| *ready < at);
+            state.coming.push_back((at, [0.0; AXES]));
+            state.commanded = [0.0; AXES];
+        }
+        if let Some(frame) = told {
+            state.port.send_at(&frame, now);
+            self.poll_port(node, now, true);
+        }
+        Ok(())
+    }
+
     /// Takes a frame of a node outside; lost if there is no such node, or too many wait.
     fn enqueue_outside(&mut self, node: usize, frame: Frame) {
         let node = self.outside_node.saturating_add(node);
@@ -597,6 +637,9 @@ impl<'c, L: Launcher> Engine<'c, L> {
                 let mut asked = 0;
                 for node in bus::nodes(*receivers) {
                     if let Some(module) = self.module(node) {
+                        if frame.function() == Some(Function::EmergencyStop) {
+                            self.interrupt(module, Interrupt::Frame(frame), *at_ns)?;
+                        }
                         self.modules[module].port.hear(frame);
                         if self.idle(module, *at_ns) {
                             asked |= 1 << module;

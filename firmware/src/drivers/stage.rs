@@ -34,6 +34,12 @@ impl Command {
         Command { torque: self.torque, rearm: [yaw || unseen_yaw, pitch || unseen_pitch] }
     }
 
+    /// What the loops do of it: with safe torque off ([`crate::torque_off`]) the motors coast.
+    #[must_use]
+    pub fn unless(self, off: bool) -> Self {
+        Command { torque: self.torque.filter(|_| !off), ..self }
+    }
+
     /// What is left of it when the loops have seen it.
     #[must_use]
     pub fn seen(self) -> Self {

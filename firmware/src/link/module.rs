@@ -8,6 +8,7 @@ use super::{BUILD, Carried, FromModule, LinkError, PROTOCOL, Sample, Status, Tex
 use crate::controller::{Controller, FIRMWARE_VERSION};
 use crate::emulated::Emulated;
 use crate::node_page::Calibration;
+use crate::torque_off::Interrupt;
 
 /// What a module says when it has booted.
 pub fn hello(policy: Option<&Policy<'_>>) -> FromModule<'static> {
@@ -77,6 +78,14 @@ fn answer(
             send(&FromModule::Sent);
         }
         ToModule::Status => send(&FromModule::Status(status(module.controller()))),
+        ToModule::Interrupt { frame } => {
+            let interrupt = frame.as_ref().map_or(Interrupt::StopInput, |frame| Interrupt::Frame(&frame.0));
+            let (off, told) = module.interrupt(interrupt);
+            if let Some(frame) = told {
+                send(&FromModule::Frame(Carried(frame)));
+            }
+            send(&FromModule::Interrupted { off });
+        }
         // Served before there is a controller.
         ToModule::Start { .. } => {}
     }

@@ -5,6 +5,7 @@ use std::cell::Cell;
 use composer_firmware::controller::{BusKind, BusOffPolicy};
 use composer_firmware::link::module::{Module, hello};
 use composer_shared::policy::{IMAGE_SIZE, Policy};
+use composer_shared::wire::StopCommand;
 
 use super::*;
 use crate::computer::Launcher;
@@ -95,7 +96,11 @@ fn modules_at_the_end_of_a_link_do_the_same_to_the_bit() {
     ] {
         let plan: FaultPlan = faults.parse().unwrap();
         for (bus_off, numbers) in [(BusOffPolicy::Recover, vec![]), (BusOffPolicy::Latch, vec![0, 1, 2, 2])] {
-            let config = SilConfig { faults: plan.draw(5, 6), seed: 5, bus_off, numbers, ..SilConfig::new(kind) };
+            let stops = [(2200 * 1_000_000, StopCommand::Stop), (2501 * 1_000_000, StopCommand::Release)];
+            let (commands, presses) = (stops.to_vec(), vec![(3_003_000_000, 4)]);
+            let drawn = plan.draw(5, 6);
+            let config =
+                SilConfig { faults: drawn, seed: 5, bus_off, numbers, commands, presses, ..SilConfig::new(kind) };
             let local = watch(|toy, observer| sil::run(toy, &image, &config, None, observer));
             let remote = watch(|toy, observer| sil::run_on(&launcher, toy, launcher.policy, &config, None, observer));
             assert!(local.1.iter().flatten().flatten().any(|bits| *bits != 0) && local.2.len() >= 80);
@@ -185,7 +190,7 @@ fn a_link_that_fails_says_how() {
     assert!(poll(&[good(), answer.clone()], &[]).contains("deadline: 7"));
     let old = FromModule::Hello { protocol: PROTOCOL + 1, firmware: 1, build: 1, policy: Some(1) };
     for (messages, noise, words) in [
-        (vec![old], &[][..], &["version 3", "version 2", "cargo qemu-image"][..]),
+        (vec![old], &[][..], &["version 4", "version 3", "cargo qemu-image"][..]),
         (
             vec![hello(None), FromModule::Refused("the policy image is damaged")],
             &[],

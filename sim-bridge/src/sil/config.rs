@@ -93,6 +93,8 @@ pub struct SilConfig {
     pub station_behind: usize,
     /// Stops and releases that the station sends, with their times in ns.
     pub commands: Vec<(u64, StopCommand)>,
+    /// When the stop input of which module has been open for long enough, with the times in ns, in their order.
+    pub presses: Vec<(u64, usize)>,
     /// Frames of a foreign device at the tail end of the cable, in order of time.
     pub injected: Vec<Injected>,
     /// What controllers do after bus-off.
@@ -122,6 +124,7 @@ impl SilConfig {
             station: true,
             station_behind: 0,
             commands: Vec::new(),
+            presses: Vec::new(),
             injected: Vec::new(),
             bus_off: BusOffPolicy::Recover,
             safety: Safety { blind_relaxes: false, ..Safety::POLICY },

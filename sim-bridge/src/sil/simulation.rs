@@ -224,6 +224,7 @@ impl<'p, P: Plant, L: Launcher> Simulation<'p, P, L> {
             }
         }
         engine.send_scripted(now);
+        engine.press_stop_inputs(now)?;
         engine.send_outside(now);
         engine.poll_ports(now);
         while let Some(event) = engine.bus.poll(now) {

@@ -5,10 +5,11 @@
 //! runs; this file loads them, aborts them, and looks what became of them.
 //!
 //! - Line 0 of the interrupts empties both receive FIFOs, of three frames each, into one queue.
+//! - A stop goes straight from there to the current loops ([`crate::stop`]), and one that the stop input asks for straight into a slot.
 //! - Line 1 comes when a frame got through, came back, or the bus-off state changed. It puts the next frame into its slot at once, even while the
 //!   main loop computes.
 
-use core::cell::UnsafeCell;
+use core::cell::{Cell, UnsafeCell};
 use core::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
 use composer_firmware::controller::{BusStatus, Micros};
@@ -21,9 +22,12 @@ use embassy_stm32::pac::can::regs;
 use embassy_stm32::pac::can::vals::{Anfe, Anfs, Tfqm};
 use embassy_stm32::peripherals::{FDCAN1, PA11, PA12};
 use embassy_stm32::{Peri, interrupt, pac, rcc};
+use embassy_sync::blocking_mutex::Mutex;
 use embassy_sync::blocking_mutex::raw::CriticalSectionRawMutex;
 use embassy_sync::channel::Channel;
 use embassy_time::Instant;
+
+use crate::stop::TORQUE_OFF;
 
 const CAN: pac::can::Fdcan = pac::FDCAN1;
 const RAM: pac::fdcanram::Fdcanram = pac::FDCANRAM1;
@@ -42,6 +46,8 @@ const FUNCTION: u16 = 0x780;
 
 static SENDER: Shared = Shared(UnsafeCell::new(Sender::new(PERIOD)));
 static QUEUE: Channel<CriticalSectionRawMutex, Frame, RECEIVED> = Channel::new();
+/// What line 1 is to send at once.
+static URGENT: Mutex<CriticalSectionRawMutex, Cell<Option<Frame>>> = Mutex::new(Cell::new(None));
 static OVERFLOWED: AtomicU32 = AtomicU32::new(0);
 /// Whether to come back after bus-off.
 static RECOVER: AtomicBool = AtomicBool::new(true);
@@ -136,6 +142,12 @@ impl Fdcan {
     pub async fn received(&mut self) -> Frame {
         QUEUE.receive().await
     }
+}
+
+/// Sends a frame without waiting for the main loop; from any interrupt.
+pub fn send_at_once(frame: Frame) {
+    URGENT.lock(|urgent| urgent.set(Some(frame)));
+    interrupt::FDCAN1_IT1.pend();
 }
 
 impl CanPort for Fdcan {
@@ -257,10 +269,11 @@ fn empty(fifo: usize) {
             if fifo == 0 { RAM.rxfifo0(first + number).read() } else { RAM.rxfifo1(first + number).read() }
         });
         CAN.rxfa(fifo).write(|w| w.set_fai(state.fgi()));
-        if let Some(frame) = frame
-            && QUEUE.try_send(frame).is_err()
-        {
-            OVERFLOWED.fetch_add(1, Ordering::Relaxed);
+        if let Some(frame) = frame {
+            TORQUE_OFF.hear(&frame);
+            if QUEUE.try_send(frame).is_err() {
+                OVERFLOWED.fetch_add(1, Ordering::Relaxed);
+            }
         }
     }
 }
@@ -300,6 +313,9 @@ fn FDCAN1_IT1() {
                 go_online();
             }
         }
+    }
+    if let Some(frame) = URGENT.lock(Cell::take) {
+        sender.push(now(), &frame);
     }
     sender.poll(now(), &mut Buffers);
 }

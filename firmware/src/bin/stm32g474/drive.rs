@@ -1,7 +1,8 @@
 //! The motors: PWM, current measurement and current loops, in step with each other.
 //!
 //! TIM1 counts up and down 20,000 times a second. At every second valley, in the middle of the time in which the bridge is on, where the current is at
-//! its mean, it triggers ADC1; when that is done its interrupt runs both current loops ([`composer_firmware::drivers::stage`]).
+//! its mean, it triggers ADC1; when that is done its interrupt runs both current loops ([`composer_firmware::drivers::stage`]). Before, it looks at the stop input and
+//! whether a stop was heard: then the motors coast, whatever the main loop is at ([`composer_firmware::torque_off`]).
 
 use core::cell::{Cell, RefCell};
 
@@ -9,9 +10,12 @@ use composer_firmware::drivers::motor::Motor;
 use composer_firmware::drivers::stage::{self, Readings, motor_config};
 pub use composer_firmware::drivers::stage::{Command, Measured};
 use composer_firmware::node_page::MotorCalibration;
+use composer_firmware::stop_input::StopInput;
+use composer_firmware::torque_off::WITHIN_US;
 use composer_shared::robot::AXES;
+use composer_shared::wire::Frame;
 use embassy_stm32::adc::{Adc, AdcChannel, Exten, InjectedAdc, SampleTime};
-use embassy_stm32::gpio::{AnyPin, Level, Output, OutputType, Speed};
+use embassy_stm32::gpio::{AnyPin, Input, Level, Output, OutputType, Speed};
 use embassy_stm32::interrupt::InterruptExt;
 use embassy_stm32::peripherals::{ADC1, PA0, PA1, PA2, PA8, PA9, TIM1};
 use embassy_stm32::time::Hertz;
@@ -22,10 +26,11 @@ use embassy_sync::blocking_mutex::Mutex;
 use embassy_sync::blocking_mutex::raw::CriticalSectionRawMutex;
 
 use crate::board::ADC_RANGE;
+use crate::stop::TORQUE_OFF;
 
 const PWM: Hertz = Hertz(20_000);
 /// Time between two runs of the current loops, s.
-const PERIOD: f32 = 1e-4;
+const PERIOD: f32 = WITHIN_US as f32 * 1e-6;
 /// Bandwidth of the current loops, rad/s: 500 Hz, a twentieth of their rate.
 const BANDWIDTH: f32 = 3142.0;
 /// Supply voltage at full scale: 3.3 V over the divider of 10 kohm and 1 kohm.
@@ -41,7 +46,28 @@ type Sensed = (InjectedAdc<'static, ADC1, 3>, Stage);
 
 static COMMAND: Shared<Cell<Command>> = Mutex::new(Cell::new(Command { torque: None, rearm: [false; AXES] }));
 static MEASURED: Shared<Cell<Measured>> = Mutex::new(Cell::new(Measured::NOTHING));
+static SWITCH: Shared<RefCell<Option<Switch>>> = Mutex::new(RefCell::new(None));
 static STAGE: Shared<RefCell<Option<Sensed>>> = Mutex::new(RefCell::new(None));
+
+/// The stop input, its reading, the time by its own count (us), and what to do when it opens.
+struct Switch {
+    pin: Input<'static>,
+    input: StopInput,
+    time: u64,
+    node: u8,
+    tell: fn(Frame),
+}
+
+impl Switch {
+    fn sample(&mut self) {
+        self.time += WITHIN_US;
+        if self.input.sample(self.time, self.pin.is_high())
+            && let Some(frame) = TORQUE_OFF.trip(self.node, true)
+        {
+            (self.tell)(frame);
+        }
+    }
+}
 
 /// The pins of both bridges, yaw and pitch.
 pub struct Bridges {
@@ -109,6 +135,12 @@ fn axis(
     Motor::new(pwm, direction, enable, motor_config(calibration, BANDWIDTH, PERIOD))
 }
 
+/// From now on the stop input of this module is looked at; `tell` gets the frame that stops the others.
+#[allow(dead_code)] // The image for the motors alone has no bus.
+pub fn watch_stop_input(pin: Input<'static>, node: u8, tell: fn(Frame)) {
+    SWITCH.lock(|switch| *switch.borrow_mut() = Some(Switch { pin, input: StopInput::default(), time: 0, node, tell }));
+}
+
 /// Sets what the current loops do from now on.
 pub fn command(command: Command) {
     COMMAND.lock(|shared| shared.set(command.after(shared.get())));
@@ -125,10 +157,17 @@ pub fn measured() -> Measured {
 
 #[embassy_stm32::interrupt]
 fn ADC1_2() {
+    SWITCH.lock(|switch| {
+        if let Ok(mut switch) = switch.try_borrow_mut()
+            && let Some(switch) = switch.as_mut()
+        {
+            switch.sample();
+        }
+    });
     let command = COMMAND.lock(|shared| {
         let command = shared.get();
         shared.set(command.seen());
-        command
+        command.unless(TORQUE_OFF.is_off())
     });
     STAGE.lock(|stage| {
         if let Ok(mut stage) = stage.try_borrow_mut()

@@ -22,8 +22,8 @@
 //!
 //! # Who runs when
 //!
-//! - The interrupt of the ADC, 10,000 times a second: the current loops ([`drive`]). Nothing interrupts it ([`board`]).
-//! - The interrupts of FDCAN: received frames into a queue, because the chip's own holds only three, and the next frame into a transmit buffer ([`can`]).
+//! - The interrupt of the ADC, 10,000 times a second: the stop input and the current loops ([`drive`]). Nothing interrupts it ([`board`]).
+//! - The interrupts of FDCAN: received frames into a queue, because the chip's own holds only three, a stop past that to the current loops ([`stop`]), and the next frame into a transmit buffer ([`can`]).
 //! - The main loop: waits for a frame, the controller's deadline, or the next sample of the sensors a millisecond later; polls the
 //!   controller and the service, sets the motors, sends what they offer.
 //!
@@ -43,6 +43,7 @@ mod flash;
 mod hardware;
 mod retained;
 mod sense;
+mod stop;
 
 use core::cell::RefCell;
 
@@ -52,7 +53,6 @@ use composer_firmware::light;
 use composer_firmware::node_page::NodePage;
 use composer_firmware::port::CanPort;
 use composer_firmware::service::Service;
-use composer_firmware::stop_input::StopInput;
 use composer_firmware::storage::read_page;
 use composer_shared::observation::Sensors;
 use composer_shared::policy::Policy;
@@ -71,6 +71,7 @@ use can::Fdcan;
 use flash::Storage;
 use hardware::Hardware;
 use sense::Sense;
+use stop::TORQUE_OFF;
 
 defmt::timestamp!("{=u64:us}", now());
 
@@ -143,8 +144,9 @@ async fn main(_spawner: Spawner) -> ! {
     );
     let mut hardware = Hardware::new(storage);
     let service = make_service(page, controller, &mut hardware);
-    let stop = Input::new(p.PB11, Pull::Up);
-    let mut parts = Parts { can: &mut can, sense: &mut sense, hardware: &mut hardware, stop: &stop, light: &mut light };
+    TORQUE_OFF.follow(boot.stop);
+    drive::watch_stop_input(Input::new(p.PB11, Pull::Up), page.node, can::send_at_once);
+    let mut parts = Parts { can: &mut can, sense: &mut sense, hardware: &mut hardware, light: &mut light };
     run(controller, service, policy.limits().torque, &mut parts, &mut watchdog).await
 }
 
@@ -179,7 +181,6 @@ struct Parts<'a, 'b> {
     can: &'a mut Fdcan,
     sense: &'a mut Sense<'b>,
     hardware: &'a mut Hardware,
-    stop: &'a Input<'static>,
     light: &'a mut Output<'static>,
 }
 
@@ -191,8 +192,7 @@ async fn run(
     parts: &mut Parts<'_, '_>,
     watchdog: &mut Watchdog,
 ) -> ! {
-    let Parts { can, sense, hardware, stop, light } = parts;
-    let mut stop_input = StopInput::default();
+    let Parts { can, sense, hardware, light } = parts;
     let mut kept = controller.retained();
     retained::keep(kept);
     let mut sensors = Sensors::ZERO;
@@ -215,11 +215,10 @@ async fn run(
             hardware.note(sense, &drive, can.status());
             log_trouble(&drive, sense);
         }
-        if stop_input.sample(now(), stop.is_high()) {
-            controller.emergency_stop(0);
-        }
+        controller.follow_stop(TORQUE_OFF.latch());
         let outputs = controller.poll(now(), &sensors, received.as_ref(), can.status().bus);
         service.poll(now(), controller, &sensors, received.as_ref(), *hardware);
+        TORQUE_OFF.follow(controller.stop_latch());
         let restart = service.restart_due(now());
         if restart {
             controller.expect_restart();

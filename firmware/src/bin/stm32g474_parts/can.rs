@@ -14,6 +14,8 @@ mod fail;
 #[path = "../stm32g474/flash.rs"]
 #[allow(dead_code)]
 mod flash;
+#[path = "../stm32g474/stop.rs"]
+mod stop;
 
 use composer_firmware::controller::FIRMWARE_VERSION;
 use composer_firmware::failsafe::{BusOffPolicy, BusStatus};
