@@ -27,6 +27,7 @@ pub mod light;
 pub mod limits;
 pub mod link;
 pub mod memory_map;
+pub mod motor_health;
 pub mod neighbours;
 pub mod node_page;
 pub mod port;

@@ -525,12 +525,31 @@ impl Environment for SnakeEnv {
         (Vector::from(self.snake.module_position(module)) + rotation * Vector::from(offset)).to_array()
     }
 
-    /// Of the kind that the task pays: the decrease of the task's distance ([`crate::tasks::Rules::imagined_distance`]) from the modules' places now to
-    /// those imagined, or -0.1 times the latter.
     fn imagined_reward(&self, positions: &[Point]) -> f32 {
         let task = &self.config.task;
-        let distance = |p: &[Point]| task.rules().imagined_distance(self.judge.course(), &self.snake, p);
-        match task.settings.reward {
+        self.imagined(positions, &|p| task.rules().imagined_distance(self.judge.course(), &self.snake, p))
+    }
+
+    fn imagined_reward_of_each(&self, positions: &[Point]) -> f32 {
+        let task = &self.config.task;
+        self.imagined(positions, &|p| task.rules().imagined_distance_of_each(self.judge.course(), &self.snake, p))
+    }
+
+    /// The centre of a module stays a link's radius off the solids of the scene and above the ground.
+    fn clipped(&self, module: usize, target: Point) -> Point {
+        let (from, radius) = (self.snake.module_position(module), self.config.robot.link_radius);
+        let to = [target[0], target[1], target[2].max(radius)];
+        let free = self.judge.course().scene.solids.iter().map(|solid| solid.entered(from, to, radius));
+        let share = free.fold(1.0, f32::min);
+        std::array::from_fn(|axis| from[axis] + share * (to[axis] - from[axis]))
+    }
+}
+
+impl SnakeEnv {
+    /// Of the kind that the task pays: the decrease of the task's distance ([`crate::tasks::Rules::imagined_distance`]) from the modules' places now to
+    /// those imagined, or -0.1 times the latter.
+    fn imagined(&self, positions: &[Point], distance: &dyn Fn(&[Point]) -> f32) -> f32 {
+        match self.config.task.settings.reward {
             Reward::Paper => -0.1 * distance(positions),
             Reward::Progress => {
                 let here: Vec<_> = (0..self.modules()).map(|module| self.snake.module_position(module)).collect();

@@ -129,6 +129,15 @@ pub trait Environment: Send {
     /// What the imagination policy earns for imagining the modules at `positions` (world, units) one step from now: the more, the nearer
     /// they would be to the state that completes the task (paper, section III-B, `R^H`).
     fn imagined_reward(&self, positions: &[Point]) -> f32;
+    /// The same, measured by where each module by itself should be.
+    fn imagined_reward_of_each(&self, positions: &[Point]) -> f32 {
+        self.imagined_reward(positions)
+    }
+    /// How far towards a target (world, units) a module could go on a straight line, for the walls and the ground.
+    fn clipped(&self, module: usize, target: Point) -> Point {
+        let _ = module;
+        target
+    }
 }
 
 /// Who is told the target of a [`Trivial`] environment.

@@ -29,6 +29,7 @@ pub mod side_by_side;
 pub mod sil;
 pub mod sim;
 pub mod stats;
+pub mod study;
 pub mod tasks;
 pub mod train;
 pub mod vary;

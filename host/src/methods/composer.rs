@@ -257,13 +257,13 @@ pub fn new(config: &TrainConfig, make: MakeEnvironment) -> Result<OnPolicy<Netwo
     let companion = config.method.imagination().then(|| {
         let seed = derive_seed(config.seed, Stream::Imagination, 0, 0);
         let imagination = &config.imagination;
-        // Without attention: it never leaves the training, where nobody has to talk. What is imagined earns a tenth of a unit: a critic that
+        // It never leaves the training, where nobody has to talk. What is imagined earns a tenth of a unit: a critic that
         // starts with numbers of size 1 would take long to get there.
-        let shape = Shape { inputs: config.inputs, ..Shape::paper(false, DISPLACEMENT) };
+        let shape = Shape { inputs: config.inputs, ..Shape::paper(imagination.attention, DISPLACEMENT) };
         let networks = Networks::new(shape, config.gradient);
         CompanionLearner {
             learner: networks.learner(seed, imagination.sigma as f32, 0.01, epsilon, rate),
-            rules: Box::new(Imagination { bound: imagination.bound as f32, follow: imagination.follow as f32 }),
+            rules: Box::new(Imagination(imagination.clone())),
             settings: OnPolicySettings {
                 gamma: imagination.gamma as f32,
                 epochs: imagination.epochs,

@@ -23,6 +23,8 @@ pub struct CurriculumConfig {
     /// Success of the episodes without faults from which on faults and variation are drawn. Higher: they begin later, on a gait that is better by then.
     /// 0: they are there from the start.
     pub start_at: f64,
+    /// Environment steps after which they begin in any case; 0: never. Higher: waits longer for a robot that does not get so good.
+    pub start_by: u64,
     /// Environment steps, counted while the healthy robot succeeds as often as that, over which their share grows to the whole. Higher: gentler.
     pub ramp_steps: u64,
     /// Share of the faults that is drawn in proportion to how often episodes with that fault of that module fail; the rest is drawn evenly. Higher:
@@ -34,7 +36,7 @@ pub struct CurriculumConfig {
 
 impl Default for CurriculumConfig {
     fn default() -> Self {
-        Self { start_at: 0.0, ramp_steps: 0, failure_share: 0.0, varied: 1.0 }
+        Self { start_at: 0.0, start_by: 0, ramp_steps: 0, failure_share: 0.0, varied: 1.0 }
     }
 }
 
@@ -182,7 +184,8 @@ impl Curriculum {
                 }
             }
         }
-        let good = self.healthy.episodes >= ENOUGH && 1.0 - self.healthy.failure() >= self.settings.start_at;
+        let waited = self.settings.start_by > 0 && self.steps >= self.settings.start_by;
+        let good = waited || self.healthy.episodes >= ENOUGH && 1.0 - self.healthy.failure() >= self.settings.start_at;
         self.begun |= good;
         if good || (self.begun && self.settings.start_at == 0.0) {
             self.climbed = (self.climbed + steps).min(self.settings.ramp_steps);
@@ -230,7 +233,8 @@ mod tests {
     #[test]
     fn faults_begin_when_the_healthy_robot_succeeds_and_grow_slowly() {
         let settings = CurriculumConfig { start_at: 0.7, ramp_steps: 400, varied: 0.5, ..Default::default() };
-        let mut curriculum = Curriculum::new(&settings, &SecondStage { from: 1000, faults: 1.5, ..Default::default() });
+        let second = SecondStage { from: 1000, faults: 1.5, ..Default::default() };
+        let mut curriculum = Curriculum::new(&settings, &second);
         let shares = |curriculum: &Curriculum| [curriculum.lesson().faults, curriculum.lesson().varied];
         curriculum.take([outcome(0, false); 40].iter(), 100);
         assert_eq!(shares(&curriculum), [0.0, 0.0]);
@@ -243,6 +247,12 @@ mod tests {
         assert_eq!(shares(&curriculum), [0.5, 0.25]);
         curriculum.take([outcome(0, true); 4000].iter(), 600);
         assert_eq!(shares(&curriculum), [1.5, 1.0]);
+        // Whoever has waited long enough begins with a robot that fails.
+        let mut waiting = Curriculum::new(&CurriculumConfig { start_by: 200, ..settings }, &SecondStage::default());
+        for expected in [0.0, 0.25, 0.5] {
+            waiting.take([outcome(0, false); 40].iter(), 100);
+            assert_eq!(waiting.lesson().faults, expected);
+        }
     }
 
     #[test]

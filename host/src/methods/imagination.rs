@@ -28,7 +28,7 @@ use serde::{Deserialize, Serialize};
 
 use super::on_policy::Companion;
 use crate::environment::Environment;
-use crate::tasks::Point;
+use crate::tasks::{Point, distance};
 
 /// Numbers that the imagination policy puts out for a module: a displacement along the three axes of its own frame.
 pub const DISPLACEMENT: usize = 3;
@@ -49,11 +49,41 @@ pub struct ImaginationConfig {
     /// Epochs of its actor (at most, as for the control policy's) and of its critic. Fewer than the control policy's: it has the easier
     /// task, and every epoch costs time.
     pub epochs: usize,
+    /// Control steps that a target is held for, at most to the end of the episode. Higher: the way there may lead aside, as a snake's must; give `bound` room
+    /// for it.
+    pub hold: usize,
+    /// The control policy pays for the growth of the distance to the target in a step, not for the distance: over the steps that a target is held it pays for
+    /// what is left, and undulation costs nothing.
+    pub telescope: bool,
+    /// Targets end at the walls that are in their way, and above the ground.
+    pub clip: bool,
+    /// Every module pays for its own distance alone, at once, instead of all for the mean.
+    pub each: bool,
+    /// What it earns is measured by where each module itself should be (shapes: its own target, not the nearest assignment; the block: on the line behind the
+    /// place to push from, and forward once the head is there).
+    pub own_targets: bool,
+    /// Taken off its own reward for each unit that the modules are away from a target when it ends. Higher: it imagines what can be followed.
+    pub feasible: f64,
+    /// Its actor attends to other modules, too.
+    pub attention: bool,
 }
 
 impl Default for ImaginationConfig {
     fn default() -> Self {
-        Self { follow: 0.1, bound: 0.5, sigma: 0.45, gamma: 0.0, epochs: 2 }
+        Self {
+            follow: 0.1,
+            bound: 0.5,
+            sigma: 0.45,
+            gamma: 0.0,
+            epochs: 2,
+            hold: 1,
+            telescope: false,
+            clip: false,
+            each: false,
+            own_targets: false,
+            feasible: 0.0,
+            attention: false,
+        }
     }
 }
 
@@ -68,6 +98,12 @@ impl ImaginationConfig {
                 bail!("imagination.{key} is {value}; it must be a number above 0");
             }
         }
+        if !(self.feasible.is_finite() && self.feasible >= 0.0) {
+            bail!("imagination.feasible is {}; it must be 0 or more", self.feasible);
+        }
+        if !(1..=1000).contains(&self.hold) {
+            bail!("imagination.hold is {}; it must be from 1 to 1000", self.hold);
+        }
         if !(0.0..=1.0).contains(&self.gamma) {
             bail!("imagination.gamma is {}; it must be from 0 to 1", self.gamma);
         }
@@ -79,12 +115,16 @@ impl ImaginationConfig {
 }
 
 /// Rules of the imagination policy.
-#[derive(Clone, Copy, Debug)]
-pub struct Imagination {
-    /// Longest displacement, units.
-    pub bound: f32,
-    /// Weight of the following error in the control policy's reward.
-    pub follow: f32,
+#[derive(Clone, Debug)]
+pub struct Imagination(pub ImaginationConfig);
+
+impl Imagination {
+    fn earned(&self, environment: &dyn Environment, plan: &[Point]) -> f32 {
+        match self.0.own_targets {
+            true => environment.imagined_reward_of_each(plan),
+            false => environment.imagined_reward(plan),
+        }
+    }
 }
 
 impl Companion for Imagination {
@@ -101,9 +141,12 @@ impl Companion for Imagination {
         let actions = actions.as_chunks::<DISPLACEMENT>().0;
         plan.clear();
         plan.extend(acts.iter().zip(actions).enumerate().map(|(module, (acts, action))| {
-            environment.place(module, if *acts { displacement(*action, self.bound) } else { [0.0; DISPLACEMENT] })
+            let bound = self.0.bound as f32;
+            let target =
+                environment.place(module, if *acts { displacement(*action, bound) } else { [0.0; DISPLACEMENT] });
+            if self.0.clip { environment.clipped(module, target) } else { target }
         }));
-        environment.imagined_reward(plan)
+        self.earned(environment, plan)
     }
 
     fn error(&self, environment: &dyn Environment, acts: &[bool], plan: &[Point]) -> f32 {
@@ -111,7 +154,34 @@ impl Companion for Imagination {
     }
 
     fn weight(&self) -> f32 {
-        self.follow
+        self.0.follow as f32
+    }
+
+    fn hold(&self) -> usize {
+        self.0.hold
+    }
+
+    fn telescopes(&self) -> bool {
+        self.0.telescope
+    }
+
+    fn each(&self) -> bool {
+        self.0.each
+    }
+
+    fn feasible(&self) -> f32 {
+        self.0.feasible as f32
+    }
+
+    fn keep(&self, environment: &dyn Environment, plan: &[Point]) -> f32 {
+        self.earned(environment, plan)
+    }
+
+    fn errors(&self, environment: &dyn Environment, acts: &[bool], plan: &[Point]) -> Vec<f32> {
+        let of = |(module, (target, acts)): (usize, (&Point, &bool))| {
+            if *acts { distance(environment.place(module, [0.0; 3]), *target) } else { 0.0 }
+        };
+        plan.iter().zip(acts).enumerate().map(of).collect()
     }
 }
 
@@ -149,7 +219,7 @@ mod tests {
     #[test]
     fn a_dead_module_stays_and_is_left_out_of_the_following_error() {
         let team = Trivial::new(3, Told::All);
-        let imagination = Imagination { bound: 1.0, follow: 1.0 };
+        let imagination = Imagination(ImaginationConfig { bound: 1.0, follow: 1.0, ..Default::default() });
         let acts = [true, false, true];
         let mut imagined = Vec::new();
         let actions = [[0.5, 0.0, 0.0], [0.9; 3], [0.0, 0.0, 0.25]];

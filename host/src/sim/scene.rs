@@ -1,5 +1,7 @@
 //! What stands on the ground besides the snake.
 
+use rapier3d::math::{Rotation, Vector};
+
 /// A box that does not move: a wall, a panel of a tube.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Solid {
@@ -18,6 +20,31 @@ impl Solid {
     pub fn rotation(&self) -> [f32; 4] {
         let ((sy, cy), (sr, cr)) = (libm::sincosf(0.5 * self.yaw), libm::sincosf(0.5 * self.roll));
         [cy * sr, sy * sr, sy * cr, cy * cr]
+    }
+
+    /// The share of the straight way between two points of the world that lies before this box, grown by `margin` on all sides; 1 if the way does not
+    /// enter it, or begins in it.
+    pub fn entered(&self, from: [f32; 3], to: [f32; 3], margin: f32) -> f32 {
+        let back = Rotation::from_array(self.rotation()).inverse();
+        let local = |p: [f32; 3]| (back * (Vector::from(p) - Vector::from(self.position))).to_array();
+        let (a, b) = (local(from), local(to));
+        let (mut enters, mut leaves) = (0.0f32, 1.0f32);
+        let mut inside = true;
+        for axis in 0..3 {
+            let half = self.half[axis] + margin;
+            inside &= a[axis].abs() < half;
+            let way = b[axis] - a[axis];
+            if way == 0.0 {
+                if a[axis].abs() >= half {
+                    return 1.0;
+                }
+                continue;
+            }
+            let (near, far) = ((-half - a[axis]) / way, (half - a[axis]) / way);
+            enters = enters.max(near.min(far));
+            leaves = leaves.min(near.max(far));
+        }
+        if inside || enters >= leaves { 1.0 } else { enters }
     }
 }
 
@@ -227,5 +254,23 @@ mod tests {
             assert!(y.abs() < 0.02 && (z - 0.5).abs() < 0.01, "{y} {z}");
             assert!(speed(&snake.state().block.unwrap()) < 1e-3);
         }
+    }
+
+    #[test]
+    fn a_way_ends_where_it_enters_a_box() {
+        let wall = Solid { half: [0.5, 4.0, 1.0], position: [3.0, 0.0, 1.0], yaw: 0.0, roll: 0.0 };
+        // Its near face, 0.4 before it, is at 2.1.
+        assert!((wall.entered([0.0, 0.0, 0.5], [6.0, 0.0, 0.5], 0.4) - 0.35).abs() < 1e-6);
+        for (from, to) in [
+            ([0.0, 0.0, 0.5], [2.0, 0.0, 0.5]),
+            ([0.0, 0.0, 2.5], [6.0, 0.0, 2.5]),
+            ([0.0, 5.0, 0.5], [6.0, 5.0, 0.5]),
+            ([6.0, 0.0, 0.5], [9.0, 0.0, 0.5]),
+            ([3.0, 0.0, 0.5], [9.0, 0.0, 0.5]),
+        ] {
+            assert_eq!(wall.entered(from, to, 0.4), 1.0, "{from:?} {to:?}");
+        }
+        let turned = Solid { yaw: std::f32::consts::FRAC_PI_2, ..wall };
+        assert!((turned.entered([3.0, -3.0, 0.5], [3.0, 3.0, 0.5], 0.4) - 0.35).abs() < 1e-6);
     }
 }

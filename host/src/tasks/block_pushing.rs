@@ -142,6 +142,22 @@ impl Rules for BlockPushing {
         let behind = self.push_from(Self::block(snake), course.goal, snake.robot().link_radius);
         positions.iter().map(|p| distance(*p, behind)).sum::<f32>() / positions.len().max(1) as f32
     }
+
+    fn imagined_distance_of_each(&self, course: &Course, snake: &Snake, positions: &[Point]) -> f32 {
+        let robot = snake.robot();
+        let block = Self::block(snake);
+        let behind = self.push_from(block, course.goal, robot.link_radius);
+        let way = flat(block, course.goal).max(1e-3);
+        let axis = [(course.goal[0] - block[0]) / way, (course.goal[1] - block[1]) / way];
+        // Once the head is there it goes as far as the block has to.
+        let on = if flat(snake.head(), behind) < robot.link_length { way } else { 0.0 };
+        let module = robot.links_per_module as f32 * robot.link_length;
+        let of = |(number, p): (usize, &Point)| {
+            let along = on - number as f32 * module;
+            distance(*p, [behind[0] + along * axis[0], behind[1] + along * axis[1], behind[2]])
+        };
+        positions.iter().enumerate().map(of).sum::<f32>() / positions.len().max(1) as f32
+    }
 }
 
 #[cfg(test)]

@@ -169,6 +169,10 @@ pub trait Rules {
     /// How far the modules would be from the state that completes the task if they were at `positions` (world, units): the distance
     /// d(p', g) of the imagination policy's reward (paper, section III-B).
     fn imagined_distance(&self, course: &Course, snake: &Snake, positions: &[Point]) -> f32;
+    /// The same, measured by where each module by itself should be, where that is not the same.
+    fn imagined_distance_of_each(&self, course: &Course, snake: &Snake, positions: &[Point]) -> f32 {
+        self.imagined_distance(course, snake, positions)
+    }
 }
 
 /// What has to be remembered of an episode.

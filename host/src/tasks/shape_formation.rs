@@ -238,6 +238,10 @@ impl Rules for ShapeFormation {
     fn imagined_distance(&self, course: &Course, _snake: &Snake, positions: &[Point]) -> f32 {
         super::wasserstein(positions, &course.marks)
     }
+
+    fn imagined_distance_of_each(&self, course: &Course, _snake: &Snake, positions: &[Point]) -> f32 {
+        mean_distance(positions, &course.marks)
+    }
 }
 
 #[cfg(test)]

@@ -2,6 +2,7 @@
 
 mod attention_maps;
 mod faults;
+mod imagination;
 mod paper;
 mod physics;
 mod policies;
@@ -56,6 +57,8 @@ enum Which {
     Robustness(robustness::Arguments),
     /// The policies that ship with every module broken, and every pair: success as a map.
     Faults(faults::Arguments),
+    /// Variants of the imagination policy against none, on the tasks where the paper finds it ahead.
+    Imagination(imagination::Arguments),
 }
 
 /// Arguments of a comparison of methods.
@@ -167,6 +170,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         Which::Physics(arguments) => physics::run(arguments),
         Which::Robustness(arguments) => robustness::run(arguments),
         Which::Faults(arguments) => faults::run(arguments),
+        Which::Imagination(arguments) => imagination::run(arguments),
     }
 }
 

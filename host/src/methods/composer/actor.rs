@@ -535,9 +535,10 @@ fn clipped_loss(
     let advantages = batch.advantages.iter().zip(&batch.modules).flat_map(|(a, n)| std::iter::repeat_n(*a, *n));
     let actions = batch.actions.chunks_exact(outputs).zip(means.chunks_exact(outputs));
     let rows = actions.zip(of_means.chunks_exact_mut(outputs)).zip(advantages);
-    for ((((actions, means), of_means), advantage), (weight, old)) in
-        rows.zip(batch.weights.iter().zip(&batch.log_probabilities))
+    for (row, ((((actions, means), of_means), advantage), (weight, old))) in
+        rows.zip(batch.weights.iter().zip(&batch.log_probabilities)).enumerate()
     {
+        let advantage = batch.own.get(row).map_or(advantage, |own| advantage + own);
         of_means.fill(0.0);
         if *weight == 0.0 {
             continue;

@@ -155,7 +155,10 @@ impl ActorLayout {
             |data: Vec<f32>, columns: usize| Tensor::<2>::from_data(TensorData::new(data, [rows, columns]), &device);
         let Some(log_sigma) = tensors[8].clone() else { unreachable!("log sigma is never empty") };
         let actions = column(padded(batch, &batch.actions, self.outputs()), self.outputs());
-        let advantages = batch.advantages.iter().flat_map(|a| std::iter::repeat_n(*a, modules)).collect();
+        let mut advantages: Vec<f32> = batch.advantages.iter().flat_map(|a| std::iter::repeat_n(*a, modules)).collect();
+        if !batch.own.is_empty() {
+            advantages.iter_mut().zip(padded(batch, &batch.own, 1)).for_each(|(advantage, own)| *advantage += own);
+        }
         let advantages = column(advantages, 1);
         // Padding weighs nothing.
         let row_weights = padded(batch, &batch.weights, 1);

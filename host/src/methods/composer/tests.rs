@@ -42,6 +42,15 @@ fn rollout(method: Method) -> Rollout {
 }
 
 fn rollout_of(shape: Shape) -> Rollout {
+    let teams: [Box<dyn Environment>; 3] = [
+        Box::new(Trivial::new(4, Told::Head)),
+        Box::new(Trivial::new(3, Told::All)),
+        Box::new(Trivial::new(5, Told::Head).with_dead(2)),
+    ];
+    rollout_with(shape, teams.into(), ImaginationConfig { bound: 0.5, follow: 0.25, ..Default::default() })
+}
+
+fn rollout_with(shape: Shape, teams: Vec<Box<dyn Environment>>, rules: ImaginationConfig) -> Rollout {
     let networks = |shape| Networks::new(shape, Differentiation::Manual);
     let mut control = networks(shape).learner(5, 0.45, 1.0, 1e-5, 1e-3);
     let imagines = Shape { inputs: shape.inputs, ..Shape::paper(false, DISPLACEMENT) };
@@ -52,19 +61,14 @@ fn rollout_of(shape: Shape) -> Rollout {
         learner.networks.load(Part::Actor, &learner.actor);
         learner.networks.load(Part::Critic, &learner.critic);
     }
-    let teams: [Box<dyn Environment>; 3] = [
-        Box::new(Trivial::new(4, Told::Head)),
-        Box::new(Trivial::new(3, Told::All)),
-        Box::new(Trivial::new(5, Told::Head).with_dead(2)),
-    ];
     let mut workers: Vec<_> = teams
         .into_iter()
         .enumerate()
         .map(|(i, team)| RolloutWorker::new(team, i, 5, 0.9, Widths::of(&control.networks), Lesson::default()))
         .collect();
-    let mut buffer = RolloutBuffer::new(3);
+    let mut buffer = RolloutBuffer::new(workers.len());
     let (mut observations, mut privileged) = (Running::new(shape.inputs), Running::new(PRIVILEGED));
-    let rules = Imagination { bound: 0.5, follow: 0.25 };
+    let rules = Imagination(rules);
     let iteration = Iteration {
         policy: &control.networks,
         companion: Some((&imagination.networks, imagination.seed, &rules)),
@@ -207,6 +211,54 @@ fn the_control_policy_pays_for_not_following() {
             assert_eq!(control.rewards[step], trajectory.rewards[step] - 0.25 * error);
         }
     }
+}
+
+#[test]
+fn targets_are_held_and_paid_for_by_coming_nearer() {
+    let shape = shapes(Method::Composer)[0];
+    let rules = ImaginationConfig { bound: 3.0, follow: 0.5, hold: 6, telescope: true, ..Default::default() };
+    let teams = || -> Vec<Box<dyn Environment>> { vec![Box::new(Drift::new(3)), Box::new(Drift::new(4))] };
+    let RolloutBuffer { trajectories, control, companion } = rollout_with(shape, teams(), rules.clone()).buffer;
+    for ((trajectory, control), imagination) in trajectories.iter().zip(&control).zip(&companion) {
+        // An episode of points has sixteen steps, as the rollout.
+        let made: Vec<usize> = (0..16).filter(|step| imagination.counts[*step]).collect();
+        assert_eq!(made, [0, 6, 12]);
+        assert!(control.counts.is_empty() && control.own.is_empty());
+        // What is paid within a target is half of what the error grew by after its first step.
+        for first in [0, 6] {
+            let paid: f32 = (first + 1..first + 6).map(|step| -control.rewards[step]).sum();
+            let grown = trajectory.companion_errors[first + 5] - trajectory.companion_errors[first];
+            assert!((paid - 0.5 * grown).abs() < 1e-5, "{paid} {grown}");
+        }
+    }
+    // Each for itself: the mean of what the modules pay is what all paid before.
+    let each = ImaginationConfig { each: true, ..rules.clone() };
+    let own = rollout_with(shape, teams(), each).buffer;
+    for (together, own) in control.iter().zip(&own.control) {
+        let modules = own.own.len() / 16;
+        for (step, paid) in own.own.chunks_exact(modules).enumerate() {
+            let mean = paid.iter().sum::<f32>() / modules as f32;
+            assert!((mean - together.rewards[step]).abs() < 1e-5 && own.rewards[step] == 0.0);
+        }
+    }
+    // What is missed at the end of a target comes off what was earned for it.
+    let feasible = rollout_with(shape, teams(), ImaginationConfig { feasible: 0.5, ..rules }).buffer;
+    for ((trajectory, before), after) in feasible.trajectories.iter().zip(&companion).zip(&feasible.companion) {
+        for step in 0..16 {
+            let end = [(0, 5), (6, 11), (12, 15)].iter().find(|(first, _)| *first == step).map(|(_, end)| *end);
+            let missed = end.map_or(0.0, |end| 0.5 * trajectory.companion_errors[end]);
+            assert!((before.rewards[step] - after.rewards[step] - missed).abs() < 1e-5, "step {step}");
+        }
+    }
+    // The gradient knows of what each module got for itself.
+    let Rollout { control, buffer: RolloutBuffer { trajectories, control: mut decisions, .. }, .. } =
+        rollout_with(shape, teams(), ImaginationConfig { each: true, hold: 6, telescope: true, ..Default::default() });
+    let batch = shaken(&trajectories, &mut decisions);
+    assert_eq!(batch.own.len(), batch.rows());
+    let layout = *control.networks.actor.layout();
+    let (automatic, manual) =
+        (layout.autodiff(&control.actor, &batch, LOSS), actor_gradient(layout, &control.actor, &batch));
+    same("each", &manual, &automatic, &layout.blocks());
 }
 
 #[test]

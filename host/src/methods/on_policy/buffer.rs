@@ -72,6 +72,10 @@ pub struct Decisions {
     pub memory: Vec<f32>,
     /// What the policy got for each step.
     pub rewards: Vec<f32>,
+    /// What each module got for itself, at once, `[step][module]`; empty if nothing. It is added to its advantage.
+    pub own: Vec<f32>,
+    /// Whether what was decided in each step counted; empty if all did.
+    pub counts: Vec<bool>,
     /// What the critic said of each step on its own scale, `[step]` or `[step][module]`, as the advantages and returns.
     pub values: Vec<f32>,
     /// Advantage of each step (see [`Decisions::estimate`]).
@@ -115,10 +119,17 @@ impl Decisions {
         self.actions.clear();
         self.log_probabilities.clear();
         self.memory.clear();
+        self.own.clear();
+        self.counts.clear();
         self.rewards.clear();
         self.values.clear();
         self.advantages.clear();
         self.returns.clear();
+    }
+
+    /// Whether what was decided in a step counted.
+    pub fn counted(&self, step: usize) -> bool {
+        self.counts.get(step).is_none_or(|counts| *counts)
     }
 
     /// Generalised advantage estimation (Schulman et al. 2016) over the trajectory that they belong to.
@@ -184,6 +195,8 @@ pub struct Batch {
     pub actions: Vec<f32>,
     /// Logarithm of the density with which each was taken, `[rows]` or `[rows, outputs]`.
     pub log_probabilities: Vec<f32>,
+    /// What is added to the advantage of each row; empty if nothing.
+    pub own: Vec<f32>,
     /// Advantages, one a sample, or one a row where every module is valued.
     pub advantages: Vec<f32>,
     /// What the critic should say, on its own scale; as many.
@@ -218,6 +231,7 @@ impl Batch {
             privileged: of(&self.privileged),
             heard: self.heard[rows.clone()].to_vec(),
             memory: of(&self.memory),
+            own: of(&self.own),
             follows: self.follows[samples.clone()].to_vec(),
             weights: of(&self.weights),
             actions: of(&self.actions),
@@ -239,7 +253,7 @@ impl Batch {
         for numbers in [observations, privileged, memory, weights, actions, log_probabilities] {
             numbers.clear();
         }
-        for numbers in [&mut self.advantages, &mut self.targets, &mut self.values] {
+        for numbers in [&mut self.advantages, &mut self.targets, &mut self.values, &mut self.own] {
             numbers.clear();
         }
     }
@@ -270,12 +284,14 @@ pub fn gather(
         batch.modules.push(n);
         batch.observations.extend_from_slice(&trajectory.observations[part(&trajectory.observations)]);
         batch.memory.extend_from_slice(&decisions.memory[part(&decisions.memory)]);
+        batch.own.extend_from_slice(&decisions.own[part(&decisions.own)]);
         let ended = |step: usize| trajectory.terminated[step] || trajectory.truncated[step];
         batch.follows.push(step > 0 && last == Some((*index, step - 1)) && !ended(step - 1));
         last = Some((*index, step));
         batch.privileged.extend_from_slice(&trajectory.privileged[at.start * PRIVILEGED..at.end * PRIVILEGED]);
         batch.heard.extend_from_slice(&trajectory.heard[at.clone()]);
-        batch.weights.extend(trajectory.acts[at].iter().map(|acts| if *acts { weight } else { 0.0 }));
+        let counted = decisions.counted(step);
+        batch.weights.extend(trajectory.acts[at].iter().map(|acts| if *acts && counted { weight } else { 0.0 }));
         batch.actions.extend_from_slice(&decisions.actions[part(&decisions.actions)]);
         let log_probabilities = &decisions.log_probabilities;
         batch.log_probabilities.extend_from_slice(&log_probabilities[part(log_probabilities)]);

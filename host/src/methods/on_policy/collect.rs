@@ -131,6 +131,45 @@ pub trait Companion: Send + Sync {
 
     /// What is taken off the control policy's reward for an error of 1.
     fn weight(&self) -> f32;
+
+    /// Steps that a plan is kept for; a new one is made earlier when an episode or a rollout begins.
+    fn hold(&self) -> usize {
+        1
+    }
+
+    /// Whether the control policy pays for the growth of the error in a step instead of for the error after it.
+    fn telescopes(&self) -> bool {
+        false
+    }
+
+    /// Whether every module pays for its own error alone.
+    fn each(&self) -> bool {
+        false
+    }
+
+    /// What is taken off its own reward for the error that is left when a plan ends.
+    fn feasible(&self) -> f32 {
+        0.0
+    }
+
+    /// What it earns for a plan that it keeps.
+    fn keep(&self, environment: &dyn Environment, plan: &[Point]) -> f32 {
+        let _ = (environment, plan);
+        0.0
+    }
+
+    /// By how much each module missed the plan; 0 for those that do not act.
+    fn errors(&self, environment: &dyn Environment, acts: &[bool], plan: &[Point]) -> Vec<f32> {
+        let _ = (environment, acts);
+        vec![0.0; plan.len()]
+    }
+}
+
+/// A plan, and the step of the rollout that it was made in.
+#[derive(Clone, Debug, Default)]
+struct Plan {
+    points: Vec<Point>,
+    since: Option<usize>,
 }
 
 /// What all environments of an iteration have in common.
@@ -261,7 +300,8 @@ fn run<C: ActorCritic>(
     };
     let mut rngs = noise(iteration.run_seed, group);
     let mut companion_rngs = iteration.companion.map_or_else(Vec::new, |(_, seed, _)| noise(seed, group));
-    let mut plans = vec![Vec::new(); group.len()];
+    let mut plans = vec![Plan::default(); group.len()];
+    let mut endings = Vec::new();
     for (worker, trajectory) in group.iter().zip(&mut *trajectories) {
         trajectory.clear(worker.modules);
     }
@@ -289,8 +329,16 @@ fn run<C: ActorCritic>(
             {
                 let n = worker.modules;
                 let actions = &decisions.actions[step * n * policy.outputs()..];
-                let reward = rules.plan(&*worker.environment, &trajectory.acts[step * n..], actions, plan);
+                let anew = plan.since.is_none_or(|since| step - since >= rules.hold());
+                let acts = &trajectory.acts[step * n..];
+                let reward = if anew {
+                    plan.since = Some(step);
+                    rules.plan(&*worker.environment, acts, actions, &mut plan.points)
+                } else {
+                    rules.keep(&*worker.environment, &plan.points)
+                };
                 decisions.rewards.push(reward);
+                decisions.counts.push(anew);
             }
         }
         exchange.memory.clear();
@@ -308,6 +356,14 @@ fn run<C: ActorCritic>(
         for (((worker, decisions), trajectory), plan) in
             group.iter_mut().zip(&mut *control).zip(&mut *trajectories).zip(&plans)
         {
+            let paying = iteration.companion.filter(|(_, _, rules)| rules.telescopes() || rules.each());
+            let errors = |worker: &RolloutWorker, trajectory: &Trajectory| {
+                paying.map(|(_, _, rules)| {
+                    let acts = &trajectory.acts[step * worker.modules..];
+                    rules.errors(&*worker.environment, acts, &plan.points)
+                })
+            };
+            let before = errors(worker, trajectory);
             let n = worker.modules;
             let actions = decisions.actions[step * n * ACTIONS..].as_chunks::<ACTIONS>().0;
             worker.actions.extend_from_slice(actions);
@@ -320,12 +376,27 @@ fn run<C: ActorCritic>(
             let mut reward =
                 iteration.rewards.as_ref().map_or(outcome.reward, |rewards| rewards.scaled(outcome.reward));
             if let Some((_, _, rules)) = iteration.companion {
-                let error = rules.error(&*worker.environment, &trajectory.acts[step * n..], plan);
+                let error = rules.error(&*worker.environment, &trajectory.acts[step * n..], &plan.points);
                 trajectory.companion_errors.push(error);
-                reward -= rules.weight() * error;
+                match (before, errors(worker, trajectory)) {
+                    (Some(before), Some(after)) => {
+                        let grown = |(before, after): (&f32, &f32)| {
+                            rules.weight() * (after - if rules.telescopes() { *before } else { 0.0 })
+                        };
+                        let paid: Vec<f32> = before.iter().zip(&after).map(grown).collect();
+                        if rules.each() {
+                            decisions.own.extend(paid.iter().map(|paid| -paid));
+                        } else {
+                            let acting = trajectory.acts[step * n..].iter().filter(|acts| **acts).count();
+                            reward -= paid.iter().sum::<f32>() / acting.max(1) as f32;
+                        }
+                    }
+                    _ => reward -= rules.weight() * error,
+                }
             }
             decisions.rewards.push(reward);
             trajectory.rewards.push(outcome.reward);
+            endings.push(outcome.terminated || outcome.truncated);
 
             let began = Instant::now();
             let truncated = outcome.truncated && !outcome.terminated;
@@ -353,6 +424,23 @@ fn run<C: ActorCritic>(
                 finals(trajectory, &worker.view, iteration);
             }
         }
+        if let Some((_, _, rules)) = iteration.companion {
+            let last = step + 1 == iteration.steps;
+            for (((decisions, trajectory), plan), ended) in
+                companion.iter_mut().zip(&*trajectories).zip(&mut plans).zip(endings.drain(..))
+            {
+                let Some(since) = plan.since else { continue };
+                if ended || last || step + 1 - since >= rules.hold() {
+                    if let (true, Some(error)) = (rules.feasible() > 0.0, trajectory.companion_errors.last()) {
+                        decisions.rewards[since] -= rules.feasible() * error;
+                    }
+                    if ended {
+                        plan.since = None;
+                    }
+                }
+            }
+        }
+        endings.clear();
     }
     physics
 }

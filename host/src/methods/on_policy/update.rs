@@ -364,6 +364,9 @@ fn update_within<C: ActorCritic>(
                 .map(|(index, t)| {
                     let trajectory = &trajectories[*index as usize];
                     let first = *t as usize * trajectory.modules;
+                    if !decisions[*index as usize].counted(*t as usize) {
+                        return 0;
+                    }
                     trajectory.acts[first..first + trajectory.modules].iter().filter(|acts| **acts).count()
                 })
                 .sum();
@@ -513,6 +516,9 @@ fn standardise(decisions: &mut [Decisions], epsilon: f64) {
     for decisions in decisions {
         for advantage in &mut decisions.advantages {
             *advantage = ((f64::from(*advantage) - mean) / (std + epsilon)) as f32;
+        }
+        for own in &mut decisions.own {
+            *own = (f64::from(*own) / (std + epsilon)) as f32;
         }
     }
 }
