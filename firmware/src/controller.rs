@@ -48,8 +48,8 @@
 //! counts as standing still.
 
 use composer_shared::kinematics::Chain;
-use composer_shared::observation::{POINTS, Sensors, Told, observe, place};
-use composer_shared::policy::{Encoded, GoalKnownTo, Policy};
+use composer_shared::observation::{Motors, POINTS, Sensors, Told, observe, place};
+use composer_shared::policy::{Encoded, GoalKnownTo, Memory, Policy};
 use composer_shared::robot::{AXES, Limits, ROOM};
 use composer_shared::wire::{
     Clearing, EmergencyStop, FRAGMENTS, Frame, Goal, Health, Heartbeat, LatentMessage, Message, Mode, NOBODY,
@@ -463,6 +463,8 @@ pub struct Controller<'a> {
     phase: Phase,
     power: Power,
     sample: Sensors,
+    /// Of the policy: empty at power-up, and where the robot begins to move.
+    memory: Memory,
     encoded: Option<Encoded>,
     points: [PointMemory; POINTS],
     /// Cycles since the station was heard; saturating.
@@ -521,6 +523,7 @@ impl<'a> Controller<'a> {
             phase: Phase::Done,
             power: Power::default(),
             sample: Sensors::ZERO,
+            memory: Memory::EMPTY,
             encoded: None,
             points: policy
                 .task()
@@ -659,7 +662,11 @@ impl<'a> Controller<'a> {
 
     /// Allows the motors to be driven; `acknowledge`: even after a reset that was not clean. The error is [`ServiceCode::NotArmable`].
     pub fn arm(&mut self, acknowledge: bool) -> Result<(), ServiceCode> {
+        let begins = !self.failsafe.armed();
         self.failsafe.arm(acknowledge)?;
+        if begins {
+            self.memory = Memory::EMPTY;
+        }
         if self.jog.is_some() {
             self.relax();
         }
@@ -1199,7 +1206,9 @@ impl<'a> Controller<'a> {
             seeker: self.policy.task().seeker(),
         };
         let place = place(self.own(), usize::from(self.config.modules));
-        let encoded = self.policy.encode(&observe(&self.sample, place, &head, &told));
+        let motors = Motors { commanded: self.torque.map(|torque| torque / self.limits.torque), ..Motors::SOUND };
+        let observation = observe(&self.sample, &motors, place, &head, &told);
+        let encoded = self.policy.encode(&mut self.memory, &observation);
         if self.policy.attention() && !self.quiet {
             self.outbox.pieces_sent = 0;
             self.outbox.latent = Some(LatentMessage {

@@ -105,12 +105,12 @@ mod tests {
         let (mut health, mut torque, mut motor) = (MotorHealth::new(), [0.0f32; AXES], [0.0f32; AXES]);
         let mut number = numbers();
         for step in 0..1_000_000 {
-            for axis in 0..AXES {
+            for (axis, (torque, motor)) in torque.iter_mut().zip(&mut motor).enumerate() {
                 // A gait that swings, and changes.
                 let swing = libm::sinf(step as f32 * (0.2 + 0.1 * axis as f32)) + 0.5 * number();
-                torque[axis] = (torque[axis] + (swing - torque[axis]).clamp(-0.5, 0.5)).clamp(-1.0, 1.0);
+                *torque = (*torque + (swing - *torque).clamp(-0.5, 0.5)).clamp(-1.0, 1.0);
                 // It gets seven tenths of the way within the step.
-                motor[axis] += 0.7 * (torque[axis] - motor[axis]);
+                *motor += 0.7 * (*torque - *motor);
             }
             health.update(torque, motor.map(|t| 0.67 * t + noise()));
             assert_eq!(health.work(), [true; AXES], "step {step}");
@@ -118,9 +118,9 @@ mod tests {
         let mut waited = 0;
         while health.work() != [false; AXES] {
             waited += 1;
-            for axis in 0..AXES {
+            for (axis, torque) in torque.iter_mut().enumerate() {
                 let swing = libm::sinf(waited as f32 * (0.2 + 0.1 * axis as f32));
-                torque[axis] = (torque[axis] + (swing - torque[axis]).clamp(-0.5, 0.5)).clamp(-1.0, 1.0);
+                *torque = (*torque + (swing - *torque).clamp(-0.5, 0.5)).clamp(-1.0, 1.0);
             }
             health.update(torque, [noise(), noise()]);
         }

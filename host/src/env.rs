@@ -7,10 +7,11 @@
 use std::sync::Arc;
 
 use composer_firmware::controller::relax_factor;
+use composer_firmware::motor_health::MotorHealth;
 use composer_shared::kinematics::Chain;
-use composer_shared::observation::{self, POINTS, Sensors, Told};
+use composer_shared::observation::{self, Motors, POINTS, Sensors, Told};
 use composer_shared::policy::{GoalKnownTo, Task};
-use composer_shared::robot::Limits;
+use composer_shared::robot::{AXES, Limits};
 use composer_shared::wire;
 use composer_sim_bridge::faults::{Fault, FaultKind, FaultPlan, ScheduledFault};
 use composer_sim_bridge::sensor_model::SensorModel;
@@ -306,6 +307,10 @@ pub struct SnakeEnv {
     chains: [Chain; 2],
     sensors: Vec<Sensors>,
     command: Vec<[f32; 2]>,
+    /// What each module knows of its motors.
+    health: Vec<MotorHealth>,
+    /// Who is heard before a cut, and behind it.
+    speaking: [u64; 2],
     heard: Vec<u64>,
     delay: usize,
     episode_return: f32,
@@ -333,6 +338,8 @@ impl SnakeEnv {
             chains: [Chain::new(config.robot.geometry()), Chain::new(config.robot.geometry())],
             sensors: vec![Sensors::ZERO; modules],
             command: vec![[0.0; 2]; modules],
+            health: vec![MotorHealth::new(); modules],
+            speaking: [0; 2],
             heard: vec![0; modules],
             delay: 1,
             episode_return: 0.0,
@@ -356,8 +363,29 @@ impl SnakeEnv {
         self.delay = self.rng.random_range(config.delay[0]..=config.delay[1]).min(config.substeps() - 1);
         self.chains = [Chain::new(config.robot.geometry()), Chain::new(config.robot.geometry())];
         self.command.fill([0.0; 2]);
+        self.health.fill(MotorHealth::new());
         self.episode_return = 0.0;
         self.sample();
+    }
+
+    /// A module's command as a fraction of the torque limit.
+    fn commanded(&self, module: usize) -> [f32; 2] {
+        self.command[module].map(|torque| torque / self.limits.torque)
+    }
+
+    /// What a module knows of motors: its own, and those of the modules next to it, as far as it hears them.
+    fn motors(&self, module: usize) -> Motors {
+        let working = |other: Option<usize>| match other {
+            None => 1.0,
+            Some(other) if self.speaking[self.now.side(module)] >> other & 1 == 0 => 0.0,
+            Some(other) => self.health[other].work().iter().filter(|works| **works).count() as f32 / AXES as f32,
+        };
+        let behind = Some(module + 1).filter(|other| *other < self.modules());
+        Motors {
+            commanded: self.commanded(module),
+            work: self.health[module].work(),
+            beside: [working(module.checked_sub(1)), working(behind)],
+        }
     }
 
     /// Samples the sensors and lets everybody hear everybody, as one control cycle on the bus does.
@@ -371,6 +399,12 @@ impl SnakeEnv {
             let bit = 1u64 << module;
             self.sensors[module] = if self.now.blind & bit != 0 { Sensors::ZERO } else { self.snake.sensors(module) };
             let speaks = self.now.gone & bit == 0 && self.sensors[module].plausible();
+            if self.now.gone & bit != 0 {
+                self.health[module] = MotorHealth::new();
+            } else if speaks {
+                let commanded = self.commanded(module);
+                self.health[module].update(commanded, self.sensors[module].torque);
+            }
             let angles = self.sensors[module].joint_angles.map(wire::quantise_angle);
             for (side, chain) in self.chains.iter_mut().enumerate() {
                 if speaks && (self.now.cut.is_none() || self.now.side(module) == side) {
@@ -381,6 +415,7 @@ impl SnakeEnv {
                 }
             }
         }
+        self.speaking = speaking;
         let missed = self.config.faults.missed_latents;
         for module in 0..modules {
             let mut heard = speaking[self.now.side(module)];
@@ -456,7 +491,8 @@ impl Environment for SnakeEnv {
             }
             let place = observation::place(module, modules);
             let told = Told { points, seeker: task.seeker() };
-            view.observations.push(observation::observe(&self.sensors[module], place, &head, &told));
+            let motors = self.motors(module);
+            view.observations.push(observation::observe(&self.sensors[module], &motors, place, &head, &told));
             let (velocity, height) = self.snake.privileged(module);
             let true_point = |n: Option<u8>| -> Option<Point> {
                 let point = self.config.task.rules().point(self.judge.course(), &self.snake, n?)?;
@@ -612,6 +648,30 @@ mod tests {
         }
         assert_eq!(env.snake().torque(3), [0.0; 2]);
         assert_eq!(env.snake().torque(2), [80.0, 0.0]);
+    }
+
+    #[test]
+    fn a_module_knows_of_its_dead_motors_and_those_beside_it() {
+        let mut env = SnakeEnv::new(Arc::new(EnvConfig::new(Task::GoalReaching, Robot::default())));
+        let fault = |fault| ScheduledFault { at_ns: 0, until_ns: None, fault };
+        env.reset_with(1, &[fault(Fault::ActuatorDead(3)), fault(Fault::Unplug(6))]);
+        let mut view = View::default();
+        for step in 0..12 {
+            env.view(&mut view);
+            let works = f32::from(u8::from(step < 6));
+            let all = &view.observations;
+            if !(2..6).contains(&step) {
+                assert_eq!(all[3][42..44], [works; 2], "step {step}");
+                assert_eq!((all[2][45], all[4][44]), (works, works), "step {step}");
+            }
+            // Nobody is missing beyond the ends; who is silent gives nothing.
+            assert_eq!([all[0][44], all[7][45], all[5][45], all[7][44]], [1.0, 1.0, 0.0, 0.0]);
+            assert_eq!((all[1][42..46].iter().sum::<f32>(), all[5][44]), (4.0, 1.0));
+            let swing = if step % 8 < 4 { 0.8 } else { -0.8 };
+            env.step(&[[swing, -swing]; 8]);
+        }
+        env.view(&mut view);
+        assert!(view.observations[0][40] != 0.0 && view.observations[0][40] == -view.observations[0][41]);
     }
 
     #[test]

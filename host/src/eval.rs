@@ -13,7 +13,7 @@ use crate::environment::{Environment, View};
 use crate::methods::mix;
 use crate::methods::workers::Workers;
 use crate::outcome::{Episode, Report};
-use crate::policy::Policy;
+use crate::policy::{Memories, Policy};
 
 /// Seed of evaluation episode `index`. Training derives its seeds from other constants, so that it never sees these episodes.
 pub fn episode_seed(seed: u64, index: u64) -> u64 {
@@ -47,10 +47,10 @@ pub fn run_episode(
     mut each: impl FnMut(&SnakeEnv, &View),
 ) -> Episode {
     env.reset_with(seed, faults);
-    let (mut view, mut actions) = (View::default(), Vec::new());
+    let (mut view, mut memories, mut actions) = (View::default(), Memories::default(), Vec::new());
     for step in 0u64.. {
         env.view(&mut view);
-        policy.act(&view, mix(seed ^ step), &mut actions, None);
+        policy.act(&view, mix(seed ^ step), &mut memories, &mut actions, None);
         each(env, &view);
         let outcome = env.step(&actions);
         if outcome.terminated || outcome.truncated {
@@ -104,14 +104,13 @@ impl Trial<'_> {
         Report::new(&episodes, self.config, fault)
     }
 
-    /// Observations of all modules at every step, for calibrating and checking a frozen policy.
-    pub fn observations(&self, policy: &dyn Policy) -> Vec<Vec<Observation>> {
-        let episodes = self.run(|env, seed, faults| {
+    /// Observations of all modules at every step of every episode, for calibrating and checking a frozen policy.
+    pub fn observations(&self, policy: &dyn Policy) -> Vec<Vec<Vec<Observation>>> {
+        self.run(|env, seed, faults| {
             let mut steps = Vec::new();
             run_episode(env, policy, seed, faults, |_, view| steps.push(view.observations.clone()));
             steps
-        });
-        episodes.into_iter().flatten().collect()
+        })
     }
 }
 

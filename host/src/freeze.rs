@@ -4,14 +4,15 @@
 //! Weights become int8 with one scale per output (the row's largest weight is 127). The latent message becomes int8
 //! with one scale per channel, which costs nothing at run time: the key's scales are multiplied into the queries, the
 //! value's into the columns of the hidden layer. Those scales, and the queries', come from observations of real
-//! episodes (calibration).
+//! episodes (calibration). A memory needs no scale of its own: it is a mean of activations, and the leak is a shift. The bias of distance comes
+//! in the unit of a logit.
 
 use std::ops::Range;
 
 use composer_shared::nn::{ARGUMENT_BITS, MAX_SHIFT, ONE};
-use composer_shared::observation::{Observation, SIZE};
+use composer_shared::observation::Observation;
 use composer_shared::policy::{
-    CLIP, CONTEXT_SHIFT, EMBED, Encoded, HIDDEN, HIDDEN_IN, IMAGE_SIZE, ImageWriter, KEY, Latent, Layer, Meta, OUT,
+    CLIP, CONTEXT_SHIFT, Encoded, HIDDEN, IMAGE_SIZE, ImageWriter, KEY, Latent, Layer, MEMORY, Memory, Meta, OUT,
     Policy, PolicyError, VALUE,
 };
 use composer_shared::robot::MAX_MODULES;
@@ -76,40 +77,44 @@ const LATENT_HEADROOM: f32 = 1.2;
 const CALIBRATION_STEPS: usize = 1000;
 /// Of these, steps on which each choice of scales is tried out.
 const TRIAL_STEPS: usize = 200;
+/// The largest bias of distance in units of a logit: finer than that would not show.
+const DISTANCE_REACH: f32 = (1u32 << 28) as f32;
 /// How much larger than in calibration a query may be before it saturates; int16 has bits to spare.
 const QUERY_HEADROOM: f32 = 4.0;
 
-/// Freezes `network` to a policy image. `calibration` holds steps of episodes, each with the observations of all
-/// modules.
-pub fn freeze(network: &Network, meta: &Meta, calibration: &[Vec<Observation>]) -> Result<Vec<u8>, FreezeError> {
+/// The observations of all modules at every step of an episode.
+pub type Steps = Vec<Vec<Observation>>;
+
+/// Freezes `network` to a policy image. `calibration` holds episodes.
+pub fn freeze(network: &Network, meta: &Meta, calibration: &[Steps]) -> Result<Vec<u8>, FreezeError> {
     network.check()?;
     if meta.attention != network.attention {
         return Err(FreezeError::Attention { meta: meta.attention, network: network.attention });
     }
-    if let Some(value) = calibration.iter().flatten().flatten().find(|x| !x.is_finite()) {
+    if let Some(value) = calibration.iter().flatten().flatten().flatten().find(|x| !x.is_finite()) {
         return Err(FreezeError::Observation(*value));
     }
-    if let Some(step) = calibration.iter().find(|step| step.len() > MAX_MODULES) {
+    if let Some(step) = calibration.iter().flatten().find(|step| step.len() > MAX_MODULES) {
         return Err(FreezeError::Modules(step.len()));
     }
-    let steps = thin_out(calibration, CALIBRATION_STEPS);
-    if steps.iter().all(|step| step.is_empty()) {
+    let sequences = thin_out(network, calibration, CALIBRATION_STEPS);
+    if sequences.iter().flatten().all(|step| step.is_empty()) {
         return Err(FreezeError::NoCalibration);
     }
     if !network.attention {
         return image(network, meta, &Scales { key: [1.0; KEY], value: [1.0; VALUE], query: 1.0 });
     }
     let float = FloatPolicy::new(network);
-    let samples = Samples::of(&float, &steps);
-    let trial = thin_out(calibration, TRIAL_STEPS);
+    let samples = Samples::of(&float, &sequences);
+    let mut trial = thin_out(network, calibration, TRIAL_STEPS);
+    // Averaged over many values the clipping of one hardly shows, so every module alone is tried as well.
+    let alone: Vec<Sequence> = trial.iter().flat_map(|sequence| one_by_one(sequence)).collect();
+    trial.extend(alone);
     let mut best: Option<(f32, Vec<u8>)> = None;
     for key in COVERED {
         for value in COVERED {
-            let image = image(network, meta, &samples.scales(key, value))?;
-            // Averaged over many values the clipping of one hardly shows, so every module alone is tried as well.
-            let alone = trial.iter().flat_map(|step| step.chunks(1));
-            let steps = trial.iter().map(|step| &step[..]).chain(alone);
-            let parity = compare(&float, &Policy::parse(&image)?, steps);
+            let image = image(network, meta, &samples.scales(key, value, &network.distance_bias))?;
+            let parity = compare(&float, &Policy::parse(&image)?, &trial);
             // Rare large differences count too.
             let cost = parity.rms + parity.max / 4.0;
             if best.as_ref().is_none_or(|(least, _)| cost < *least) {
@@ -120,22 +125,26 @@ pub fn freeze(network: &Network, meta: &Meta, calibration: &[Vec<Observation>]) 
     best.map(|(_, image)| image).ok_or(FreezeError::NoCalibration)
 }
 
-/// Compares the actions of `network` and `policy` on `steps`, in which every module hears every other.
+/// Compares the actions of `network` and `policy` in these episodes, in which every module hears every other.
 ///
 /// # Panics
 /// If a step has more than 64 modules.
-pub fn parity(network: &Network, policy: &Policy, steps: &[Vec<Observation>]) -> Parity {
-    compare(&FloatPolicy::new(network), policy, steps.iter().map(|step| &step[..]))
+pub fn parity(network: &Network, policy: &Policy, episodes: &[Steps]) -> Parity {
+    compare(&FloatPolicy::new(network), policy, &thin_out(network, episodes, usize::MAX))
 }
 
-fn compare<'a>(float: &FloatPolicy, policy: &Policy, steps: impl Iterator<Item = &'a [Observation]>) -> Parity {
+fn compare(float: &FloatPolicy, policy: &Policy, sequences: &[Sequence]) -> Parity {
     let mut differences = Vec::new();
-    for observations in steps {
-        let n = observations.len();
-        let mut exact = vec![[0.0; OUT]; n];
-        float.act(observations, &vec![u64::MAX; n], &mut exact, None);
-        let integer = act(policy, observations);
-        differences.extend(exact.as_flattened().iter().zip(integer.as_flattened()).map(|(f, i)| (f - i).abs()));
+    for sequence in sequences {
+        let n = sequence.iter().map(|step| step.len()).max().unwrap_or(0);
+        let (mut exact_memories, mut memories) = (vec![[0.0; MEMORY]; n], vec![Memory::EMPTY; n]);
+        for observations in sequence {
+            let n = observations.len();
+            let mut exact = vec![[0.0; OUT]; n];
+            float.act(&mut exact_memories[..n], observations, &vec![u64::MAX; n], &mut exact, None);
+            let integer = act(policy, &mut memories[..n], observations);
+            differences.extend(exact.as_flattened().iter().zip(integer.as_flattened()).map(|(f, i)| (f - i).abs()));
+        }
     }
     differences.sort_by(f32::total_cmp);
     let samples = differences.len();
@@ -148,21 +157,38 @@ fn compare<'a>(float: &FloatPolicy, policy: &Policy, steps: impl Iterator<Item =
     }
 }
 
-/// The actions of the integer `policy` for all modules of one robot, all of which hear each other.
+/// The actions of the integer `policy` for all modules of one robot, all of which hear each other; `memories` has one a module, which goes on by a
+/// step.
 ///
 /// # Panics
 /// If there are more than 64 modules.
-pub fn act(policy: &Policy, observations: &[Observation]) -> Vec<[f32; OUT]> {
-    let encoded: Vec<Encoded> = observations.iter().map(|o| policy.encode(o)).collect();
+pub fn act(policy: &Policy, memories: &mut [Memory], observations: &[Observation]) -> Vec<[f32; OUT]> {
+    let encoded: Vec<Encoded> =
+        observations.iter().zip(memories).map(|(observation, memory)| policy.encode(memory, observation)).collect();
     let mut latents = [Latent::ZERO; MAX_MODULES];
     latents[..encoded.len()].iter_mut().zip(&encoded).for_each(|(to, from)| *to = from.latent);
     let heard = u64::MAX.checked_shr(64 - encoded.len() as u32).unwrap_or(0);
     encoded.iter().enumerate().map(|(i, own)| policy.act(own, &latents, heard, None, i)).collect()
 }
 
-/// At most `count` of `steps`, evenly spread.
-fn thin_out(steps: &[Vec<Observation>], count: usize) -> Vec<&Vec<Observation>> {
-    steps.iter().step_by(steps.len().div_ceil(count).max(1)).collect()
+/// Steps that follow each other.
+type Sequence<'a> = Vec<&'a [Observation]>;
+
+/// At most `count` steps of these episodes, evenly spread, each for itself; of a network with memory whole episodes, evenly spread, until there are so
+/// many steps.
+fn thin_out<'a>(network: &Network, episodes: &'a [Steps], count: usize) -> Vec<Sequence<'a>> {
+    let steps: usize = episodes.iter().map(Vec::len).sum();
+    let every = steps.div_ceil(count).max(1);
+    if network.memory == 0 {
+        return episodes.iter().flatten().step_by(every).map(|step| vec![&step[..]]).collect();
+    }
+    episodes.iter().step_by(every).map(|episode| episode.iter().map(|step| &step[..]).collect()).collect()
+}
+
+/// The sequences of its modules.
+fn one_by_one<'a>(sequence: &Sequence<'a>) -> Vec<Sequence<'a>> {
+    let modules = sequence.iter().map(|step| step.len()).min().unwrap_or(0);
+    (0..modules).map(|module| sequence.iter().map(|step| &step[module..=module]).collect()).collect()
 }
 
 /// What one unit of the integers stands for.
@@ -181,25 +207,28 @@ struct Samples {
 }
 
 impl Samples {
-    fn of(float: &FloatPolicy, steps: &[&Vec<Observation>]) -> Self {
+    fn of(float: &FloatPolicy, sequences: &[Sequence]) -> Self {
         let mut samples = Samples {
             query: [const { Vec::new() }; KEY],
             key: [const { Vec::new() }; KEY],
             value: [const { Vec::new() }; VALUE],
         };
         let push = |to: &mut [Vec<f32>], from: &[f32]| to.iter_mut().zip(from).for_each(|(to, x)| to.push(x.abs()));
-        for latent in steps.iter().flat_map(|step| float.latents(step)) {
-            push(&mut samples.query, &latent[..KEY]);
-            push(&mut samples.key, &latent[KEY..2 * KEY]);
-            push(&mut samples.value, &latent[2 * KEY..]);
+        for sequence in sequences {
+            let mut memories = vec![[0.0; MEMORY]; sequence.iter().map(|step| step.len()).max().unwrap_or(0)];
+            for latent in sequence.iter().flat_map(|step| float.latents(&mut memories[..step.len()], step)) {
+                push(&mut samples.query, &latent[..KEY]);
+                push(&mut samples.key, &latent[KEY..2 * KEY]);
+                push(&mut samples.value, &latent[2 * KEY..]);
+            }
         }
         let all = samples.query.iter_mut().chain(&mut samples.key).chain(&mut samples.value);
         all.for_each(|channel| channel.sort_by(f32::total_cmp));
         samples
     }
 
-    /// Scales that represent these shares of keys and values without saturating.
-    fn scales(&self, key_share: f64, value_share: f64) -> Scales {
+    /// Scales that represent these shares of keys and values without saturating, and a bias of distance.
+    fn scales(&self, key_share: f64, value_share: f64, distance_bias: &[f32]) -> Scales {
         let scale = |channel: &Vec<f32>, share: f64| {
             let rank = (channel.len() as f64 * share).ceil() as usize;
             let reach = channel.get(rank.clamp(1, channel.len().max(1)) - 1).copied().unwrap_or(0.0);
@@ -211,6 +240,8 @@ impl Samples {
         let reaches = self.query.iter().zip(key).map(|(channel, key)| channel.last().copied().unwrap_or(0.0) * key);
         let reach = reaches.fold(0.0, f32::max);
         let query = if reach > 1e-20 { QUERY_HEADROOM * reach / f32::from(ONE) } else { 1.0 };
+        let bias = distance_bias.iter().fold(0.0, |largest: f32, bias| largest.max(bias.abs()));
+        let query = query.max(bias * (KEY as f32).sqrt() / DISTANCE_REACH);
         Scales { key, value, query }
     }
 }
@@ -220,34 +251,39 @@ fn image(network: &Network, meta: &Meta, scales: &Scales) -> Result<Vec<u8>, Fre
     let one = f64::from(ONE);
     let argument = f64::from(1u32 << ARGUMENT_BITS);
     let mut image = Box::new([0; IMAGE_SIZE]);
-    let mut writer = ImageWriter::new(meta, &mut image);
-    for field in 0..SIZE {
+    let mut writer = ImageWriter::new(meta, network.shape(), &mut image);
+    for field in 0..network.inputs {
         let gain = one / (f64::from(CLIP) * f64::from(network.std[field]));
         writer.input(field, network.mean[field], gain as f32);
     }
 
     // The unit of an activation is 1 / 32767, that of an argument of tanh 1 / 65536.
     let activation = 1.0 / one;
+    let features = network.features();
     let biased = |dense: &Dense, unit: f64| Some((dense.bias.clone(), unit));
-    let encoder = Rows::of(&network.encoder, "encoder", 0..SIZE, |_| f64::from(CLIP) * activation);
+    let encoder = Rows::of(&network.encoder, "encoder", 0..network.inputs, |_| f64::from(CLIP) * activation);
     encoder.write(&mut writer, Layer::Encoder, |_| argument, biased(&network.encoder, argument))?;
     if network.attention {
-        let query = Rows::of(&network.query, "query", 0..EMBED, |_| activation);
+        let query = Rows::of(&network.query, "query", 0..features, |_| activation);
         let query_unit = |o: usize| f64::from(scales.query) / f64::from(scales.key[o]);
         query.write(&mut writer, Layer::Query, |o| query_unit(o).recip(), None)?;
-        let key = Rows::of(&network.key, "key", 0..EMBED, |_| activation);
+        let key = Rows::of(&network.key, "key", 0..features, |_| activation);
         key.write(&mut writer, Layer::Key, |o| f64::from(scales.key[o]).recip(), None)?;
-        let value = Rows::of(&network.value, "value", 0..EMBED, |_| activation);
+        let value = Rows::of(&network.value, "value", 0..features, |_| activation);
         value.write(&mut writer, Layer::Value, |o| f64::from(scales.value[o]).recip(), None)?;
         // A unit of the logits in Q16 of base-2 logarithms.
         let unit = f64::from(scales.query) / (KEY as f64).sqrt() * std::f64::consts::LOG2_E * 65536.0;
         let shift = shift_for(unit).ok_or_else(|| query.too_large())?;
         writer.softmax((unit * 2f64.powi(shift.into())).round() as i32, shift);
+        for (bucket, bias) in network.distance_bias.iter().enumerate() {
+            let unit = f64::from(scales.query) / (KEY as f64).sqrt();
+            writer.distance(bucket, (f64::from(*bias) / unit).round() as i32);
+        }
         let unit = |i: usize| f64::from(scales.value[i]) * f64::from(1u32 << CONTEXT_SHIFT) * activation;
-        let context = Rows::of(&network.hidden, "hidden", EMBED..HIDDEN_IN, unit);
+        let context = Rows::of(&network.hidden, "hidden", features..features + VALUE, unit);
         context.write(&mut writer, Layer::Context, |_| argument, None)?;
     }
-    let hidden = Rows::of(&network.hidden, "hidden", 0..EMBED, |_| activation);
+    let hidden = Rows::of(&network.hidden, "hidden", 0..features, |_| activation);
     hidden.write(&mut writer, Layer::Hidden, |_| argument, biased(&network.hidden, argument))?;
     let output = Rows::of(&network.output, "output", 0..HIDDEN, |_| activation);
     output.write(&mut writer, Layer::Output, |_| one, biased(&network.output, one))?;
@@ -309,7 +345,8 @@ fn shift_for(largest: f64) -> Option<u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::network::testing::{observations, random_network};
+    use crate::network::testing::{observations, random_network, random_network_of};
+    use composer_shared::observation::{BASE, SIZE};
     use composer_shared::policy::{GoalKnownTo, Task};
     use composer_shared::robot::{Geometry, Limits};
 
@@ -327,8 +364,25 @@ mod tests {
         }
     }
 
-    fn steps(seed: u64, count: u64, modules: usize) -> Vec<Vec<Observation>> {
-        (0..count).map(|step| observations(seed * 1_000_003 + step, modules)).collect()
+    fn steps(seed: u64, count: u64, modules: usize) -> Vec<Steps> {
+        vec![(0..count).map(|step| observations(seed * 1_000_003 + step, modules)).collect()]
+    }
+
+    /// Episodes in which what a module observes changes slowly, as that of a robot does.
+    fn episodes(seed: u64, count: u64, length: u64, modules: usize) -> Vec<Steps> {
+        (0..count)
+            .map(|episode| {
+                let mut now = observations(seed * 7919 + episode, modules);
+                let mut go_on = |step| {
+                    for (now, to) in now.iter_mut().zip(observations(seed * 7919 + episode + 1_000_000 * step, modules))
+                    {
+                        now.iter_mut().zip(to).for_each(|(now, to)| *now = 0.9 * *now + 0.4 * to);
+                    }
+                    now.clone()
+                };
+                (1..=length).map(&mut go_on).collect()
+            })
+            .collect()
     }
 
     #[test]
@@ -350,17 +404,72 @@ mod tests {
         println!("largest difference of an action: {worst:.4}");
     }
 
+    /// Memory, bias of distance and the whole observation, over episodes longer than any task's.
+    #[test]
+    fn integers_with_a_memory_follow_the_float_network() {
+        let mut worst = 0.0f32;
+        for seed in 0..8 {
+            let (attention, inputs) = (seed % 4 != 3, [SIZE, SIZE, BASE, SIZE][seed as usize % 4]);
+            let network = random_network_of(seed, attention, inputs, MEMORY);
+            let image = freeze(&network, &meta(attention), &episodes(seed, 10, 60, 8)).unwrap();
+            let policy = Policy::parse(&image).unwrap();
+            assert_eq!(policy.shape(), network.shape());
+            assert_eq!(policy.distance_bias(), attention);
+            for (modules, length) in [(1, 2000), (8, 500), (11, 100), (64, 20)] {
+                let parity = parity(&network, &policy, &episodes(seed + 100, 2, length, modules));
+                println!("seed {seed}, {modules} modules, {length} steps, attention {attention}: {parity:?}");
+                assert!(parity.rms < 0.01 && parity.p99 < 0.025 && parity.max < 0.05, "{parity:?}");
+                worst = worst.max(parity.max);
+            }
+        }
+        println!("largest difference of an action: {worst:.4}");
+    }
+
+    /// The memories themselves drift apart by no more than the embeddings do, however long it goes on.
+    #[test]
+    fn a_memory_of_integers_does_not_drift() {
+        let network = random_network_of(3, true, SIZE, MEMORY);
+        let image = freeze(&network, &meta(true), &episodes(3, 10, 60, 8)).unwrap();
+        let (policy, float) = (Policy::parse(&image).unwrap(), FloatPolicy::new(&network));
+        let (mut memories, mut exact) = ([Memory::EMPTY; 4], [[0.0; MEMORY]; 4]);
+        let mut worst = [0.0f32; 2];
+        for (step, observations) in episodes(9, 1, 4000, 4)[0].iter().enumerate() {
+            act(&policy, &mut memories, observations);
+            float.latents(&mut exact, observations);
+            for (memory, exact) in memories.iter().zip(&exact) {
+                for (got, exact) in memory.activations().iter().zip(exact) {
+                    let half = usize::from(step >= 2000);
+                    worst[half] = worst[half].max((f32::from(*got) / f32::from(ONE) - exact).abs());
+                }
+            }
+        }
+        println!("largest difference of a memory: {worst:?}");
+        // That of int8 weights, no more in the second half than in the first.
+        assert!(worst[0] < 0.05 && worst[1] < 1.2 * worst[0], "{worst:?}");
+    }
+
+    #[test]
+    fn a_large_bias_over_small_queries_fits() {
+        let mut network = random_network_of(11, true, SIZE, MEMORY);
+        network.query.weights.iter_mut().for_each(|w| *w *= 1e-9);
+        network.distance_bias[8] = 30.0;
+        let image = freeze(&network, &meta(true), &episodes(11, 2, 50, 8)).unwrap();
+        let policy = Policy::parse(&image).unwrap();
+        let parity = parity(&network, &policy, &episodes(12, 2, 50, 8));
+        assert!(parity.max < 0.05, "{parity:?}");
+    }
+
     #[test]
     fn attention_of_integers_follows_the_float_network() {
         let network = random_network(1, true);
         let image = freeze(&network, &meta(true), &steps(1, 300, 8)).unwrap();
         let policy = Policy::parse(&image).unwrap();
         let mut worst = 0.0f32;
-        for step in steps(2, 100, 8) {
+        for step in steps(2, 100, 8).remove(0) {
             let (mut actions, mut expected) = ([[0.0; 2]; 8], [0.0; 64]);
             let heard = [0b1010_0110; 8];
-            FloatPolicy::new(&network).act(&step, &heard, &mut actions, Some(&mut expected));
-            let encoded: Vec<_> = step.iter().map(|o| policy.encode(o)).collect();
+            FloatPolicy::new(&network).act(&mut [[0.0; MEMORY]; 8], &step, &heard, &mut actions, Some(&mut expected));
+            let encoded: Vec<_> = step.iter().map(|o| policy.encode(&mut Memory::default(), o)).collect();
             let mut latents = [Latent::ZERO; MAX_MODULES];
             (0..8).for_each(|j| latents[j] = encoded[j].latent);
             for i in 0..8 {
@@ -389,25 +498,26 @@ mod tests {
         let image = freeze(&network, &meta(true), &steps(7, 10, 4)).unwrap();
         let policy = Policy::parse(&image).unwrap();
         assert!(parity(&network, &policy, &steps(8, 10, 4)).max < 1e-4);
-        assert!(act(&policy, &observations(8, 4)).as_flattened().iter().any(|a| *a != 0.0));
+        assert!(act(&policy, &mut [Memory::EMPTY; 4], &observations(8, 4)).as_flattened().iter().any(|a| *a != 0.0));
     }
 
     #[test]
     fn what_cannot_be_frozen_is_refused_in_one_sentence() {
         let network = random_network(9, true);
-        let said = |network: &Network, meta: &Meta, steps: &[Vec<Observation>]| {
-            freeze(network, meta, steps).unwrap_err().to_string()
-        };
+        let said =
+            |network: &Network, meta: &Meta, steps: &[Steps]| freeze(network, meta, steps).unwrap_err().to_string();
         let good = steps(9, 3, 8);
         assert!(said(&network, &meta(true), &[]).contains("needs observations of real episodes"));
         assert!(said(&network, &meta(false), &good).contains("attention = false"));
         assert!(said(&network, &meta(true), &steps(9, 1, 65)).contains("65 modules"));
         let mut bad = good.clone();
-        bad[1][2][3] = f32::INFINITY;
+        bad[0][1][2][3] = f32::INFINITY;
         assert!(said(&network, &meta(true), &bad).contains("contains inf"));
         let mut broken = network.clone();
         broken.query.weights[0] = f32::NAN;
         assert!(said(&broken, &meta(true), &good).contains("the query layer"));
+        let too_much = Network::zeros_of(true, SIZE, 32);
+        assert!(said(&too_much, &meta(true), &good).contains("has room for 16 or none"));
         let mut huge = network.clone();
         huge.hidden.weights[0] = 1e30;
         assert!(said(&huge, &meta(true), &good).contains("too large for fixed point"));

@@ -10,7 +10,7 @@ use crate::environment::{Environment, View};
 use crate::eval::{Trial, episode_seed};
 use crate::methods::mix;
 use crate::outcome;
-use crate::policy::Policy;
+use crate::policy::{Memories, Policy};
 use crate::replay::{Episode, FrameRecord, Look, Outline, Pose, Recording, Robot, Setting, Shape, Status};
 use crate::sil::SnakePlant;
 use crate::sim::Snake;
@@ -204,10 +204,11 @@ pub fn simulate(
     env.reset_with(seed, faults);
     let mut recorder = Recorder::begin(name, &config.task, env.snake(), env.judge(), faults);
     let (mut view, mut actions, modules) = (View::default(), Vec::new(), env.modules());
+    let mut memories = Memories::default();
     for step in 0u64.. {
         let mut weights = Vec::new();
         env.view(&mut view);
-        policy.act(&view, mix(seed ^ step), &mut actions, Some(&mut weights));
+        policy.act(&view, mix(seed ^ step), &mut memories, &mut actions, Some(&mut weights));
         let hit = env.faults();
         let outcome = env.step(&actions);
         let time = outcome.steps as f32 * config.control_period;

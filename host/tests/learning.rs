@@ -6,6 +6,7 @@ use composer_host::environment::{Environment, View};
 use composer_host::methods::baselines::PpoConfig;
 use composer_host::methods::smp::SmpConfig;
 use composer_host::methods::{Algorithm, Method, TrainConfig, create};
+use composer_host::policy::Memories;
 
 /// Trains to the end and returns the mean return of the last iterations' episodes, as learning curves have it, and of 50 episodes without noise.
 fn train(config: &TrainConfig, make: &dyn Fn() -> Box<dyn Environment>) -> (f64, f64) {
@@ -26,9 +27,10 @@ fn without_noise(algorithm: &dyn Algorithm, make: &dyn Fn() -> Box<dyn Environme
     let mut total = 0.0;
     for seed in 0..50 {
         environment.reset(1_000_000 + seed);
+        let mut memories = Memories::default();
         loop {
             environment.view(&mut view);
-            policy.act(&view, 0, &mut actions, None);
+            policy.act(&view, 0, &mut memories, &mut actions, None);
             let outcome = environment.step(&actions);
             if outcome.terminated || outcome.truncated {
                 total += f64::from(outcome.episode_return) / 50.0;

@@ -115,6 +115,8 @@ pub struct Dense<'a, const IN: usize, const OUT: usize> {
     pub bias: Option<&'a [[u8; 4]; OUT]>,
     /// The shift of all outputs for [`requantise`].
     pub shift: u8,
+    /// Inputs that count, from the first on; those behind must be zero, and need not be looked at.
+    pub columns: usize,
 }
 
 impl<const IN: usize, const OUT: usize> Dense<'_, IN, OUT> {
@@ -122,7 +124,7 @@ impl<const IN: usize, const OUT: usize> Dense<'_, IN, OUT> {
     #[inline]
     pub fn forward(&self, input: &[i16; IN], out: &mut [i32; OUT]) {
         #[cfg(dsp)]
-        dsp::accumulate(self.weights, input, out);
+        dsp::accumulate(self.weights, input, out, self.columns);
         #[cfg(not(dsp))]
         accumulate_portable(self.weights, input, out);
         self.scale(out);

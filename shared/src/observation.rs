@@ -23,6 +23,15 @@
 //! | 35 | the second point is known | - | - | 0 or 1; if 0, fields 28..35 are 0 |
 //! | 36..39 | vector to the third point | robot units | own | / 10, clipped to +-2 |
 //! | 39 | the third point is known | - | - | 0 or 1; if 0, fields 36..39 are 0 |
+//! | 40..42 | torque commanded in the last control step, yaw and pitch | of the limit | axis | 1 |
+//! | 42..44 | the own motors work, yaw and pitch | - | axis | 1, or 0 if dead |
+//! | 44 | share of the motors of the next module towards the head that work | - | - | 0, 1/2 or 1 |
+//! | 45 | the same towards the tail | - | - | 0, 1/2 or 1 |
+//! | 46 | ln(1 + distance of the own frame to the first point) | ln(robot units) | - | 1; 0 if the goal is not known |
+//! | 47 | ln(1 + distance of the own frame to the head link) | ln(robot units) | - | 1 |
+//!
+//! The first [`BASE`] fields are the paper's protocol. A network takes those alone or all of them
+//! ([`crate::policy::Shape::inputs`]).
 //!
 //! "Own" is the frame of the module's second link ([`crate::robot::Geometry::OWN_LINK`]); distances are measured from the centre of the
 //! head link, or, if every module seeks a place of its own, from the origin of the own frame. What the three points are is the
@@ -34,7 +43,7 @@ use crate::kinematics::Pose;
 use crate::robot::{AXES, MAX_JOINTS};
 
 /// Numbers in an observation.
-pub const SIZE: usize = 40;
+pub const SIZE: usize = 48;
 
 /// How many of them, the first, are the paper's protocol.
 pub const BASE: usize = 40;
@@ -87,6 +96,14 @@ pub const NAMES: [&str; SIZE] = [
     "third_y",
     "third_z",
     "third_known",
+    "commanded_yaw",
+    "commanded_pitch",
+    "works_yaw",
+    "works_pitch",
+    "works_towards_head",
+    "works_towards_tail",
+    "own_goal_log_distance",
+    "own_head_log_distance",
 ];
 
 /// Who is to come to the goal.
@@ -113,6 +130,23 @@ impl Told {
     pub fn goal(goal: Vector3<f32>) -> Self {
         Told { points: [Some(goal), None, None], seeker: Seeker::Head }
     }
+}
+
+/// What a module knows of its motors and of those of the modules next to it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Motors {
+    /// Torque commanded in the last control step, as a fraction of the limit, yaw and pitch.
+    pub commanded: [f32; AXES],
+    /// Whether the own motors work, yaw and pitch.
+    pub work: [bool; AXES],
+    /// Share of the motors that work of the next module towards the head and of the next towards the tail: 0 if it is silent, 1 where the chain
+    /// ends, for nobody is missing there.
+    pub beside: [f32; 2],
+}
+
+impl Motors {
+    /// Nothing commanded, and all motors work.
+    pub const SOUND: Motors = Motors { commanded: [0.0; AXES], work: [true; AXES], beside: [1.0; 2] };
 }
 
 /// One sample of a module's own sensors.
@@ -170,11 +204,11 @@ fn norm(v: Vector3<f32>) -> f32 {
 
 /// Builds the observation of a module.
 ///
-/// `place` is 0 at the head and 1 at the tail; `head` the pose of the head link in the own frame
+/// `motors` is what it knows of motors; `place` is 0 at the head and 1 at the tail; `head` the pose of the head link in the own frame
 /// ([`crate::kinematics::Chain::head_seen_from`]); `told` what this module is told of the scene.
 ///
 /// A module whose sensors are not [plausible](Sensors::plausible) observes nothing: all zeros, the paper's observation fault.
-pub fn observe(sensors: &Sensors, place: f32, head: &Pose, told: &Told) -> Observation {
+pub fn observe(sensors: &Sensors, motors: &Motors, place: f32, head: &Pose, told: &Told) -> Observation {
     let mut o = [0.0; SIZE];
     if !sensors.plausible() {
         return o;
@@ -189,6 +223,7 @@ pub fn observe(sensors: &Sensors, place: f32, head: &Pose, told: &Told) -> Obser
         if let Some(fields) = o.first_chunk_mut() {
             point_fields(fields, here, distance);
         }
+        o[46] = libm::logf(1.0 + norm(here));
     }
     if let Some(second) = second
         && let Some(fields) = o.get_mut(28..).and_then(|o| o.first_chunk_mut())
@@ -214,6 +249,12 @@ pub fn observe(sensors: &Sensors, place: f32, head: &Pose, told: &Told) -> Obser
     o[22] = sensors.torque[0];
     o[23] = sensors.torque[1];
     o[27] = place;
+    for axis in 0..AXES {
+        o[40 + axis] = motors.commanded[axis];
+        o[42 + axis] = f32::from(u8::from(motors.work[axis]));
+        o[44 + axis] = motors.beside[axis];
+    }
+    o[47] = libm::logf(1.0 + norm(head.position));
     o
 }
 
@@ -235,7 +276,13 @@ mod tests {
     #[test]
     fn the_goal_arrives_in_the_own_frame() {
         let chain = Chain::new(Geometry::default());
-        let o = observe(&level(), place(1, 8), &chain.head_seen_from(1), &Told::goal(Vector3::new(0.0, 5.0, 0.0)));
+        let o = observe(
+            &level(),
+            &Motors::SOUND,
+            place(1, 8),
+            &chain.head_seen_from(1),
+            &Told::goal(Vector3::new(0.0, 5.0, 0.0)),
+        );
         // Module 1's second link is 2.5 units behind the head.
         assert!((o[0] - 0.25).abs() < 1e-6 && (o[1] - 0.5).abs() < 1e-6);
         let direction: f32 = o[3..6].iter().map(|v| v * v).sum();
@@ -250,15 +297,29 @@ mod tests {
         let chain = Chain::new(Geometry::default());
         let points = [(3.0, 4.0), (0.0, -2.0), (-30.0, 1.0)].map(|(x, y)| Some(Vector3::new(x, y, 0.0)));
         let head = chain.head_seen_from(1);
-        let by_head = observe(&level(), 0.0, &head, &Told { points, seeker: Seeker::Head });
-        let each = observe(&level(), 0.0, &head, &Told { points, seeker: Seeker::Each });
+        let by_head = observe(&level(), &Motors::SOUND, 0.0, &head, &Told { points, seeker: Seeker::Head });
+        let each = observe(&level(), &Motors::SOUND, 0.0, &head, &Told { points, seeker: Seeker::Each });
         assert!((by_head[6] - libm::logf(6.0)).abs() < 1e-6);
         // 2.5 units behind the head it is 5.5 along and 4 aside.
         assert!((each[6] - libm::logf(1.0 + libm::hypotf(5.5, 4.0))).abs() < 1e-6);
         assert!(by_head[..6] == each[..6] && by_head[7..] == each[7..]);
+        assert!((by_head[46] - libm::logf(1.0 + libm::hypotf(5.5, 4.0))).abs() < 1e-6);
+        assert!((by_head[47] - libm::logf(3.5)).abs() < 1e-6);
         assert!((each[28] - 0.25).abs() < 1e-6 && (each[29] + 0.2).abs() < 1e-6 && each[35] == 1.0);
         assert!((each[34] - libm::logf(3.0)).abs() < 1e-6 && (each[32] / each[31] + 0.8).abs() < 1e-5);
         assert!(each[36] == -2.0 && (each[37] - 0.1).abs() < 1e-6 && each[39] == 1.0);
+    }
+
+    #[test]
+    fn what_is_known_of_motors_comes_behind_the_papers_fields() {
+        let chain = Chain::new(Geometry::default());
+        let motors = Motors { commanded: [0.25, -0.5], work: [true, false], beside: [0.5, 1.0] };
+        let told = Told::goal(Vector3::new(1.0, 2.0, 3.0));
+        let [o, sound] =
+            [motors, Motors::SOUND].map(|motors| observe(&level(), &motors, 0.5, &chain.head_seen_from(3), &told));
+        assert_eq!(o[BASE..46], [0.25, -0.5, 1.0, 0.0, 0.5, 1.0]);
+        assert_eq!(sound[BASE..46], [0.0, 0.0, 1.0, 1.0, 1.0, 1.0]);
+        assert!(o[..BASE] == sound[..BASE] && o[46..] == sound[46..]);
     }
 
     #[test]
@@ -266,10 +327,10 @@ mod tests {
         let chain = Chain::new(Geometry::default());
         let mut sensors = level();
         assert!(sensors.plausible());
-        let o = observe(&sensors, 0.0, &chain.head_seen_from(0), &Told::default());
-        assert!(o[..8].iter().chain(&o[28..]).all(|v| *v == 0.0) && o[10] == 1.0);
+        let o = observe(&sensors, &Motors::SOUND, 0.0, &chain.head_seen_from(0), &Told::default());
+        assert!(o[..8].iter().chain(&o[28..BASE]).all(|v| *v == 0.0) && o[10] == 1.0 && o[46] == 0.0);
         sensors.angular_rate[1] = f32::NAN;
         assert!(!sensors.plausible() && !Sensors::ZERO.plausible());
-        assert_eq!(observe(&sensors, 0.5, &chain.head_seen_from(0), &Told::default()), [0.0; SIZE]);
+        assert_eq!(observe(&sensors, &Motors::SOUND, 0.5, &chain.head_seen_from(0), &Told::default()), [0.0; SIZE]);
     }
 }

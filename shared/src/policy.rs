@@ -8,9 +8,13 @@
 //!
 //! ```text
 //! z = clip((x - mean) / std, -5, 5)          e = tanh(W_enc z + b_enc)
-//! q = W_q e,   k = W_k e,   v = W_v e        w_j = softmax_j(q . k_j / sqrt(16))
-//! c = sum_j w_j v_j                          h = tanh(W_hid [e; c] + b_hid)          a = clip(W_out h + b_out, -1, 1)
+//! m <- m + leak (e - m)                      f = [e; m]
+//! q = W_q f,   k = W_k f,   v = W_v f        w_j = softmax_j(q . k_j / sqrt(16) + b_d(j))
+//! c = sum_j w_j v_j                          h = tanh(W_hid [f; c] + b_hid)          a = clip(W_out h + b_out, -1, 1)
 //! ```
+//!
+//! m is the [`Memory`] of the module, over the first 16 channels of e; b is a bias by the distance along the chain ([`distance_bucket`]). A
+//! network may have neither, and may take the first 40 fields of the observation alone ([`Shape`]): the paper's has and does so.
 
 use core::fmt;
 
@@ -21,11 +25,11 @@ use crate::observation::{self, Observation, POINTS, Seeker};
 use crate::robot::{AXES, Geometry, Limits, MAX_JOINTS, ROOM};
 
 /// Version of the layout that this code reads and writes.
-pub const VERSION: u16 = 3;
+pub const VERSION: u16 = 4;
 /// The first bytes of every image.
 pub const MAGIC: [u8; 8] = *b"COMPOSER";
 
-/// Width of the observation.
+/// Width of the observation; a network may take the first [`observation::BASE`] fields alone.
 pub const OBS: usize = observation::SIZE;
 /// Width of the embedding.
 pub const EMBED: usize = 64;
@@ -37,12 +41,96 @@ pub const VALUE: usize = 32;
 pub const HIDDEN: usize = 64;
 /// Width of the action: yaw and pitch torque.
 pub const OUT: usize = AXES;
-/// Inputs of the hidden layer, embedding and context together.
+/// Channels of the memory.
+pub const MEMORY: usize = 16;
+/// Width of embedding and memory together: what query, key, value and hidden layer see.
+pub const FEATURES: usize = EMBED + MEMORY;
+/// Inputs of the hidden layer of a network without memory: embedding and context.
 pub const HIDDEN_IN: usize = EMBED + VALUE;
+/// Distances along the chain that the attention may tell apart: [`distance_bucket`].
+pub const DISTANCE_BUCKETS: usize = 13;
 /// Normalised observations are clipped to plus and minus this.
 pub const CLIP: f32 = 5.0;
 
-const DIMENSIONS: [u16; 6] = [OBS as u16, EMBED as u16, KEY as u16, VALUE as u16, HIDDEN as u16, OUT as u16];
+/// Widths of embedding, key, value, hidden layer and action.
+const DIMENSIONS: [u16; 5] = [EMBED as u16, KEY as u16, VALUE as u16, HIDDEN as u16, OUT as u16];
+
+/// Which of [`DISTANCE_BUCKETS`] the way along the chain from module `from` to module `to` falls into: 6 for itself, less towards the head, more
+/// towards the tail; 1, 2, 3 to 4, 5 to 8, 9 to 16, 17 and more modules away.
+pub const fn distance_bucket(from: usize, to: usize) -> usize {
+    let ring = match from.abs_diff(to) {
+        0 => 0,
+        1 => 1,
+        2 => 2,
+        3..=4 => 3,
+        5..=8 => 4,
+        9..=16 => 5,
+        _ => 6,
+    };
+    if to < from { 6 - ring } else { 6 + ring }
+}
+
+/// What networks of this layout may differ in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct Shape {
+    /// Fields of the observation that it takes, from the first on: [`observation::BASE`] or [`OBS`].
+    pub inputs: u16,
+    /// Channels of its memory: 0 or [`MEMORY`].
+    pub memory: u8,
+}
+
+impl Shape {
+    /// The paper's protocol.
+    pub const BASE: Shape = Shape { inputs: observation::BASE as u16, memory: 0 };
+    /// All there is.
+    pub const FULL: Shape = Shape { inputs: OBS as u16, memory: MEMORY as u8 };
+
+    fn check(self) -> Result<(), PolicyError> {
+        if !matches!(usize::from(self.inputs), observation::BASE | OBS) {
+            return Err(PolicyError::Inputs(self.inputs));
+        }
+        if !matches!(usize::from(self.memory), 0 | MEMORY) {
+            return Err(PolicyError::Memory(self.memory));
+        }
+        Ok(())
+    }
+}
+
+/// Fraction bits of a [`Memory`] beyond those of an activation: the leak moves it even where it nearly is what it follows.
+pub const MEMORY_BITS: u32 = 12;
+
+/// How far a channel of the memory goes in one control step: `2^-leak` of the way.
+pub const fn leak(channel: usize) -> u32 {
+    if channel < MEMORY / 2 { 2 } else { 4 }
+}
+
+/// What a module remembers from one control step to the next: leaky means of the first channels of its embedding, the first half of them over
+/// about 4 steps, the second over about 16. Empty at power-up and at the start of an episode. It never leaves the module.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Memory([i32; MEMORY]);
+
+impl Memory {
+    /// Nothing has been seen.
+    pub const EMPTY: Memory = Memory([0; MEMORY]);
+
+    /// One more step.
+    fn update(&mut self, embedding: &[i16; EMBED]) {
+        for (channel, (mean, now)) in self.0.iter_mut().zip(embedding).enumerate() {
+            *mean += ((i32::from(*now) << MEMORY_BITS) - *mean) >> leak(channel);
+        }
+    }
+
+    /// As activations, Q15.
+    pub fn activations(&self) -> [i16; MEMORY] {
+        self.0.map(|mean| nn::saturate16((mean + (1 << (MEMORY_BITS - 1))) >> MEMORY_BITS))
+    }
+}
+
+impl Default for Memory {
+    fn default() -> Self {
+        Memory::EMPTY
+    }
+}
 
 /// What the policy was trained to do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -240,11 +328,15 @@ pub enum PolicyError {
         /// The version it has.
         found: u16,
     },
-    /// Another network: widths of observation, embedding, key, value, hidden layer and action.
+    /// Another network: widths of embedding, key, value, hidden layer and action.
     Dimensions {
         /// The widths it has.
-        found: [u16; 6],
+        found: [u16; 5],
     },
+    /// It takes another number of fields of the observation.
+    Inputs(u16),
+    /// It has a memory of another number of channels.
+    Memory(u8),
     /// The length it states is not that of its layout.
     Length {
         /// The length it states.
@@ -304,8 +396,17 @@ impl fmt::Display for PolicyError {
                 list(f, &found)?;
                 f.write_str(", this build runs ")?;
                 list(f, &DIMENSIONS)?;
-                f.write_str(" (observation, embedding, key, value, hidden, action)")
+                f.write_str(" (embedding, key, value, hidden, action)")
             }
+            Self::Inputs(found) => write!(
+                f,
+                "the policy image holds a network of {found} inputs, this build knows the first {} fields of the observation or all {OBS}",
+                observation::BASE
+            ),
+            Self::Memory(found) => write!(
+                f,
+                "the policy image holds a network with a memory of {found} channels, there is room for {MEMORY} or none"
+            ),
             Self::Length { stated } => {
                 write!(f, "the policy image says it is {stated} bytes long, layout version {VERSION} is {IMAGE_SIZE}")
             }
@@ -335,13 +436,13 @@ impl core::error::Error for PolicyError {}
 pub enum Layer {
     /// Observation to embedding, then tanh.
     Encoder,
-    /// Embedding to query, no bias.
+    /// Embedding and memory to query, no bias.
     Query,
-    /// Embedding to key, no bias.
+    /// Embedding and memory to key, no bias.
     Key,
-    /// Embedding to value, no bias.
+    /// Embedding and memory to value, no bias.
     Value,
-    /// Embedding to hidden.
+    /// Embedding and memory to hidden.
     Hidden,
     /// Context to hidden, no bias: the sum of both goes through tanh. Apart from [`Layer::Hidden`] because embedding
     /// and context differ in size, so that a common scale of the weights would cost one of them bits. All zero without
@@ -360,7 +461,7 @@ impl Layer {
     pub const fn inputs(self) -> usize {
         match self {
             Layer::Encoder => OBS,
-            Layer::Query | Layer::Key | Layer::Value | Layer::Hidden => EMBED,
+            Layer::Query | Layer::Key | Layer::Value | Layer::Hidden => FEATURES,
             Layer::Context => VALUE,
             Layer::Output => HIDDEN,
         }
@@ -414,10 +515,13 @@ const LIMITS_AT: usize = 36;
 const PERIOD_AT: usize = 56;
 const RELAX_AT: usize = 60;
 const DIGEST_AT: usize = 64;
-const MEAN_AT: usize = 68;
+const MEMORY_AT: usize = 68;
+const RESERVED_2_AT: usize = 69;
+const MEAN_AT: usize = 72;
 const GAIN_AT: usize = MEAN_AT + 4 * OBS;
 const SOFTMAX_AT: usize = GAIN_AT + 4 * OBS;
-const LAYERS_AT: usize = SOFTMAX_AT + 8;
+const DISTANCE_AT: usize = SOFTMAX_AT + 8;
+const LAYERS_AT: usize = DISTANCE_AT + 4 * DISTANCE_BUCKETS;
 const CRC_AT: usize = Layer::Output.offset() + Layer::Output.size();
 
 /// Bytes of an image.
@@ -448,7 +552,8 @@ impl Default for Latent {
 /// What a module keeps of its observation for [`Policy::act`], and what it sends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Encoded {
-    embedding: [i16; EMBED],
+    /// Embedding and memory.
+    features: [i16; FEATURES],
     query: [i16; KEY],
     /// The message for the others.
     pub latent: Latent,
@@ -458,15 +563,18 @@ pub struct Encoded {
 #[derive(Clone, Copy, Debug)]
 pub struct Policy<'a> {
     meta: Meta,
+    shape: Shape,
     crc: u32,
     mean: &'a [[u8; 4]; OBS],
     gain: &'a [[u8; 4]; OBS],
     softmax: (i32, u8),
+    /// None if all are zero.
+    distance: Option<&'a [[u8; 4]; DISTANCE_BUCKETS]>,
     encoder: Dense<'a, OBS, EMBED>,
-    query: Dense<'a, EMBED, KEY>,
-    key: Dense<'a, EMBED, KEY>,
-    value: Dense<'a, EMBED, VALUE>,
-    hidden: Dense<'a, EMBED, HIDDEN>,
+    query: Dense<'a, FEATURES, KEY>,
+    key: Dense<'a, FEATURES, KEY>,
+    value: Dense<'a, FEATURES, VALUE>,
+    hidden: Dense<'a, FEATURES, HIDDEN>,
     context: Dense<'a, VALUE, HIDDEN>,
     output: Dense<'a, HIDDEN, OUT>,
 }
@@ -487,14 +595,17 @@ impl<'a> Policy<'a> {
             VERSION => {}
             found => return Err(PolicyError::Version { found }),
         }
-        let found: &[u8; 12] = bytes(image, DIMENSIONS_AT).ok_or(too_short)?;
-        let mut dimensions = [0; 6];
+        let found: &[u8; 10] = bytes(image, DIMENSIONS_AT + 2).ok_or(too_short)?;
+        let mut dimensions = [0; 5];
         for (dimension, bytes) in dimensions.iter_mut().zip(found.as_chunks().0) {
             *dimension = u16::from_le_bytes(*bytes);
         }
         if dimensions != DIMENSIONS {
             return Err(PolicyError::Dimensions { found: dimensions });
         }
+        let [memory] = *bytes(image, MEMORY_AT).ok_or(too_short)?;
+        let shape = Shape { inputs: u16::from_le_bytes(*bytes(image, DIMENSIONS_AT).ok_or(too_short)?), memory };
+        shape.check()?;
         let stated = u32::from_le_bytes(*bytes(image, LENGTH_AT).ok_or(too_short)?);
         if stated as usize != IMAGE_SIZE {
             return Err(PolicyError::Length { stated });
@@ -503,11 +614,11 @@ impl<'a> Policy<'a> {
             return Err(PolicyError::TooLong { length: image.len() });
         }
         let image: &[u8; IMAGE_SIZE] = image.try_into().map_err(|_| too_short)?;
-        Self::parse_whole(image).unwrap_or(Err(too_short))
+        Self::parse_whole(image, shape).unwrap_or(Err(too_short))
     }
 
     /// `None` cannot happen: all offsets lie within the image. It saves the control path from a panic.
-    fn parse_whole(image: &'a [u8; IMAGE_SIZE]) -> Option<Result<Self, PolicyError>> {
+    fn parse_whole(image: &'a [u8; IMAGE_SIZE], shape: Shape) -> Option<Result<Self, PolicyError>> {
         let byte = |at: usize| image.get(at).copied();
         let u32_at = |at: usize| bytes(image, at).map(|b| u32::from_le_bytes(*b));
         let f32_at = |at: usize| u32_at(at).map(f32::from_bits);
@@ -526,6 +637,9 @@ impl<'a> Policy<'a> {
             ("attention", ATTENTION_AT, 1),
             ("trained with faults", FAULTS_AT, 1),
             ("reserved", RESERVED_AT, 0),
+            ("reserved", RESERVED_2_AT, 0),
+            ("reserved", RESERVED_2_AT + 1, 0),
+            ("reserved", RESERVED_2_AT + 2, 0),
         ];
         for (field, at, largest) in flags {
             let found = byte(at)?;
@@ -565,25 +679,44 @@ impl<'a> Policy<'a> {
         if let Err(error) = check_softmax(multiplier, shift) {
             return Some(Err(error));
         }
+        let distance = rows::<4, DISTANCE_BUCKETS>(image, DISTANCE_AT)?;
+        for bias in distance {
+            if let Err(error) = check_distance(i32::from_le_bytes(*bias)) {
+                return Some(Err(error));
+            }
+        }
         for layer in Layer::ALL {
             if let Err(error) = check_shift(u32_at(layer.offset())?) {
                 return Some(Err(error));
             }
         }
+        let (inputs, features) = (usize::from(shape.inputs), EMBED + usize::from(shape.memory));
         Some(Ok(Policy {
             meta,
+            shape,
             crc: stored,
             mean,
             gain,
             softmax: (multiplier, shift as u8),
-            encoder: dense(image, Layer::Encoder)?,
-            query: dense(image, Layer::Query)?,
-            key: dense(image, Layer::Key)?,
-            value: dense(image, Layer::Value)?,
-            hidden: dense(image, Layer::Hidden)?,
-            context: dense(image, Layer::Context)?,
-            output: dense(image, Layer::Output)?,
+            distance: distance.iter().any(|bias| *bias != [0; 4]).then_some(distance),
+            encoder: dense(image, Layer::Encoder, inputs)?,
+            query: dense(image, Layer::Query, features)?,
+            key: dense(image, Layer::Key, features)?,
+            value: dense(image, Layer::Value, features)?,
+            hidden: dense(image, Layer::Hidden, features)?,
+            context: dense(image, Layer::Context, VALUE)?,
+            output: dense(image, Layer::Output, HIDDEN)?,
         }))
+    }
+
+    /// Which of the networks of this layout it is.
+    pub fn shape(&self) -> Shape {
+        self.shape
+    }
+
+    /// Whether the attention has a bias by distance along the chain.
+    pub fn distance_bias(&self) -> bool {
+        self.distance.is_some()
     }
 
     /// All that the image says about itself.
@@ -647,21 +780,33 @@ impl<'a> Policy<'a> {
         self.crc as u16
     }
 
-    /// From the observation of a module to its embedding, query and latent message.
+    /// One control step of a module, up to its message: from its observation to embedding, query and latent. `memory` is that of this module; it
+    /// goes on by a step, if the network has one. Call it once a control cycle.
     ///
     /// Values more than five standard deviations from the mean saturate there, infinite ones too; what is not a number
     /// counts as the mean.
-    pub fn encode(&self, observation: &Observation) -> Encoded {
+    pub fn encode(&self, memory: &mut Memory, observation: &Observation) -> Encoded {
         let mut input = [0; OBS];
-        for ((x, value), (mean, gain)) in input.iter_mut().zip(observation).zip(self.mean.iter().zip(self.gain)) {
+        let fields = input.iter_mut().zip(observation).take(usize::from(self.shape.inputs));
+        for ((x, value), (mean, gain)) in fields.zip(self.mean.iter().zip(self.gain)) {
             *x = nn::quantise(*value, f32::from_le_bytes(*mean), f32::from_le_bytes(*gain));
         }
-        let mut encoded = Encoded { embedding: [0; EMBED], query: [0; KEY], latent: Latent::ZERO };
-        self.encoder.forward_to(&input, &mut encoded.embedding, nn::tanh);
+        let mut embedding = [0; EMBED];
+        self.encoder.forward_to(&input, &mut embedding, nn::tanh);
+        let mut encoded = Encoded { features: [0; FEATURES], query: [0; KEY], latent: Latent::ZERO };
+        let remembered = if self.shape.memory > 0 {
+            memory.update(&embedding);
+            memory.activations()
+        } else {
+            [0; MEMORY]
+        };
+        for (feature, x) in encoded.features.iter_mut().zip(embedding.into_iter().chain(remembered)) {
+            *feature = x;
+        }
         if self.meta.attention {
-            self.query.forward_to(&encoded.embedding, &mut encoded.query, nn::saturate16);
-            self.key.forward_to(&encoded.embedding, &mut encoded.latent.key, nn::saturate8);
-            self.value.forward_to(&encoded.embedding, &mut encoded.latent.value, nn::saturate8);
+            self.query.forward_to(&encoded.features, &mut encoded.query, nn::saturate16);
+            self.key.forward_to(&encoded.features, &mut encoded.latent.key, nn::saturate8);
+            self.value.forward_to(&encoded.features, &mut encoded.latent.value, nn::saturate8);
         }
         encoded
     }
@@ -682,7 +827,7 @@ impl<'a> Policy<'a> {
     ) -> [f32; AXES] {
         let own_index = own_index.min(ROOM - 1);
         let mut hidden = [0; HIDDEN];
-        self.hidden.forward(&own.embedding, &mut hidden);
+        self.hidden.forward(&own.features, &mut hidden);
         if self.meta.attention {
             let (context, weights) = self.attend(own, latents, heard, own_index);
             let mut more = [0; HIDDEN];
@@ -725,6 +870,10 @@ impl<'a> Policy<'a> {
         for j in nn::ones(mask) {
             if let Some(logit) = logits.get_mut(j) {
                 *logit = query.dot(&latent(j).key);
+                // Both are far from what an i32 holds: |q . k| <= 2^26, |bias| <= 2^29.
+                if let Some(bias) = self.distance.and_then(|bias| bias.get(distance_bucket(own_index, j))) {
+                    *logit = logit.saturating_add(i32::from_le_bytes(*bias));
+                }
             }
         }
         let weights = nn::softmax(&logits, mask, self.softmax.0, self.softmax.1);
@@ -766,6 +915,16 @@ fn check_softmax(multiplier: i32, shift: u32) -> Result<(), PolicyError> {
     check_shift(shift)
 }
 
+/// Largest bias of a logit; logits have to lie within +-2^30.
+const DISTANCE_BIAS_MAX: i32 = 1 << 29;
+
+fn check_distance(bias: i32) -> Result<(), PolicyError> {
+    if !(-DISTANCE_BIAS_MAX..=DISTANCE_BIAS_MAX).contains(&bias) {
+        return Err(PolicyError::Value { field: "distance bias", range: "-536870912 to 536870912" });
+    }
+    Ok(())
+}
+
 fn check_shift(shift: u32) -> Result<(), PolicyError> {
     if !(1..=u32::from(nn::MAX_SHIFT)).contains(&shift) {
         return Err(PolicyError::Value { field: "shift", range: "1 to 62" });
@@ -783,8 +942,8 @@ fn rows<const IN: usize, const OUT: usize>(image: &[u8], at: usize) -> Option<&[
     image.get(at..)?.as_chunks().0.first_chunk()
 }
 
-/// A view of a layer.
-fn dense<const IN: usize, const OUT: usize>(image: &[u8], layer: Layer) -> Option<Dense<'_, IN, OUT>> {
+/// A view of a layer of which the first `columns` inputs count.
+fn dense<const IN: usize, const OUT: usize>(image: &[u8], layer: Layer, columns: usize) -> Option<Dense<'_, IN, OUT>> {
     let shift = u32::from_le_bytes(*bytes(image, layer.offset())?) as u8;
     let multipliers_at = layer.offset() + 4;
     let bias_at = multipliers_at + 4 * OUT;
@@ -794,6 +953,7 @@ fn dense<const IN: usize, const OUT: usize>(image: &[u8], layer: Layer) -> Optio
         multipliers: rows(image, multipliers_at)?,
         bias: if layer.has_bias() { Some(rows(image, bias_at)?) } else { None },
         shift,
+        columns,
     })
 }
 
@@ -806,16 +966,17 @@ pub struct ImageWriter<'a> {
 
 impl<'a> ImageWriter<'a> {
     /// Begins an image with its header.
-    pub fn new(meta: &Meta, image: &'a mut [u8; IMAGE_SIZE]) -> Self {
+    pub fn new(meta: &Meta, shape: Shape, image: &'a mut [u8; IMAGE_SIZE]) -> Self {
         image.fill(0);
-        let mut writer = ImageWriter { image, error: meta.check().err() };
+        let mut writer = ImageWriter { image, error: meta.check().and(shape.check()).err() };
         writer.put(0, &MAGIC);
         writer.put(VERSION_AT, &VERSION.to_le_bytes());
         writer.put(TASK_AT, &[meta.task as u8, meta.goal_known_to as u8]);
         writer.put(LENGTH_AT, &(IMAGE_SIZE as u32).to_le_bytes());
-        for (i, dimension) in DIMENSIONS.iter().enumerate() {
+        for (i, dimension) in [shape.inputs].iter().chain(&DIMENSIONS).enumerate() {
             writer.put(DIMENSIONS_AT + 2 * i, &dimension.to_le_bytes());
         }
+        writer.put(MEMORY_AT, &[shape.memory]);
         writer.put(
             ATTENTION_AT,
             &[u8::from(meta.attention), u8::from(meta.trained_with_faults), meta.geometry.links_per_module, 0],
@@ -851,6 +1012,14 @@ impl<'a> ImageWriter<'a> {
         self.put(SOFTMAX_AT + 4, &u32::from(shift).to_le_bytes());
     }
 
+    /// What is added to the logit of a module at this distance, in units of a logit: see [`distance_bucket`].
+    pub fn distance(&mut self, bucket: usize, bias: i32) {
+        if bucket < DISTANCE_BUCKETS {
+            self.note(check_distance(bias));
+            self.put(DISTANCE_AT + 4 * bucket, &bias.to_le_bytes());
+        }
+    }
+
     /// The shift of a layer: see [`nn::Dense`].
     pub fn shift(&mut self, layer: Layer, shift: u8) {
         self.note(check_shift(shift.into()));
@@ -858,7 +1027,7 @@ impl<'a> ImageWriter<'a> {
     }
 
     /// One output of a layer. The bias of a layer without one is ignored, as are an output and weights that the layer
-    /// does not have.
+    /// does not have. Weights that are not given are zero.
     pub fn row(&mut self, layer: Layer, output: usize, multiplier: i32, bias: i32, weights: &[i8]) {
         if output >= layer.outputs() {
             return;
@@ -908,8 +1077,13 @@ const RANDOM_LIMITS: Limits =
     Limits { torque: 80.0, torque_slew: 400.0, joint_angle: 3.1, joint_speed: 3.0, temperature: 80.0 };
 
 /// An untrained policy with weights drawn from `seed`, for tests: activations of about the size that trained networks
-/// have, paper's robot, control period 50 ms, with attention.
+/// have, paper's robot, control period 50 ms, with attention, of the paper's protocol.
 pub fn random_image(seed: u32, image: &mut [u8; IMAGE_SIZE]) {
+    random_image_of(Shape::BASE, seed, image);
+}
+
+/// [`random_image`] of this shape; if that has a memory, with a bias by distance, too.
+pub fn random_image_of(shape: Shape, seed: u32, image: &mut [u8; IMAGE_SIZE]) {
     let meta = Meta {
         task: Task::GoalReaching,
         goal_known_to: GoalKnownTo::All,
@@ -930,8 +1104,9 @@ pub fn random_image(seed: u32, image: &mut [u8; IMAGE_SIZE]) {
         let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
         (z >> 56) as i8
     };
-    let mut writer = ImageWriter::new(&meta, image);
-    for field in 0..OBS {
+    let mut writer = ImageWriter::new(&meta, shape, image);
+    let (inputs, features) = (usize::from(shape.inputs), EMBED + usize::from(shape.memory));
+    for field in 0..inputs {
         writer.input(field, 0.0, f32::from(nn::ONE) / CLIP);
     }
     // Logits differ by about two, in natural units.
@@ -947,11 +1122,22 @@ pub fn random_image(seed: u32, image: &mut [u8; IMAGE_SIZE]) {
             Layer::Output => (1 << 20, 30),
         };
         writer.shift(layer, shift);
+        let columns = match layer.inputs() {
+            FEATURES => features,
+            OBS => inputs,
+            columns => columns,
+        };
         for output in 0..layer.outputs() {
-            let mut weights = [0; EMBED];
-            weights.fill_with(|| next().max(-127));
+            // As many are drawn as an embedding has, used or not: the pinned bits of old images depend on it.
+            let mut weights = [0; FEATURES];
+            weights.iter_mut().take(columns.max(EMBED)).for_each(|weight| *weight = next().max(-127));
             let bias = i32::from(next()) << 6;
-            writer.row(layer, output, multiplier, bias, &weights);
+            writer.row(layer, output, multiplier, bias, weights.get(..columns).unwrap_or_default());
+        }
+    }
+    if shape.memory > 0 {
+        for bucket in 0..DISTANCE_BUCKETS {
+            writer.distance(bucket, i32::from(next()) << 14);
         }
     }
     // Its numbers are constants within range.
@@ -977,17 +1163,18 @@ mod tests {
     fn observations(seed: u32) -> [Observation; 8] {
         let mut state = seed.wrapping_mul(2_654_435_761) | 1;
         core::array::from_fn(|_| {
-            core::array::from_fn(|_| {
+            let base: [f32; observation::BASE] = core::array::from_fn(|_| {
                 state ^= state << 13;
                 state ^= state >> 17;
                 state ^= state << 5;
                 (state >> 16) as f32 / 16384.0 - 2.0
-            })
+            });
+            core::array::from_fn(|i| base.get(i).copied().unwrap_or(-base[i % observation::BASE]))
         })
     }
 
     fn encode_all(policy: &Policy, observations: &[Observation; 8]) -> ([Encoded; 8], [Latent; MAX_MODULES]) {
-        let encoded = observations.each_ref().map(|o| policy.encode(o));
+        let encoded = observations.each_ref().map(|o| policy.encode(&mut Memory::default(), o));
         let mut latents = [Latent::ZERO; MAX_MODULES];
         latents.iter_mut().zip(&encoded).for_each(|(to, from)| *to = from.latent);
         (encoded, latents)
@@ -1016,26 +1203,30 @@ mod tests {
             task_digest: 0x89ab_cdef,
         };
         let mut image = Box::new([0; IMAGE_SIZE]);
-        let mut writer = ImageWriter::new(&meta, &mut image);
+        let mut writer = ImageWriter::new(&meta, Shape::FULL, &mut image);
         writer.input(3, 1.5, 2.5);
         writer.shift(Layer::Output, 9);
         writer.row(Layer::Output, 1, -7, 77, &[-5; HIDDEN]);
         writer.row(Layer::Value, 31, 3, 99, &[6; EMBED]);
+        writer.distance(12, -8);
         writer.finish().unwrap();
         let policy = Policy::parse(&image[..]).unwrap();
-        assert_eq!(policy.meta(), meta);
+        assert_eq!((policy.meta(), policy.shape()), (meta, Shape::FULL));
+        assert_eq!(policy.distance.unwrap()[11..], [[0; 4], (-8i32).to_le_bytes()]);
+        assert!(policy.distance_bias());
         assert_eq!((f32::from_le_bytes(policy.mean[3]), f32::from_le_bytes(policy.gain[3])), (1.5, 2.5));
         assert_eq!((policy.output.shift, policy.output.weights[1]), (9, [0xfb; HIDDEN]));
         assert_eq!(policy.output.multipliers[1], (-7i32).to_le_bytes());
         assert_eq!(policy.output.bias.unwrap()[1], 77i32.to_le_bytes());
-        assert_eq!((policy.value.weights[31], policy.value.weights[30]), ([6; EMBED], [0; EMBED]));
+        let sixes = core::array::from_fn(|i| if i < EMBED { 6 } else { 0 });
+        assert_eq!((policy.value.weights[31], policy.value.weights[30]), (sixes, [0; FEATURES]));
         assert!(policy.value.bias.is_none());
     }
 
     #[test]
     fn the_layout_is_the_documented_one() {
-        assert_eq!(Layer::ALL.map(Layer::offset), [396, 3472, 4564, 5656, 7836, 12448, 14756]);
-        assert_eq!((IMAGE_SIZE, MEAN_AT, SOFTMAX_AT, CRC_AT), (14908, 68, 388, 14904));
+        assert_eq!(Layer::ALL.map(Layer::offset), [516, 4104, 5452, 6800, 9492, 15128, 17436]);
+        assert_eq!((IMAGE_SIZE, MEAN_AT, SOFTMAX_AT, CRC_AT), (17588, 72, 456, 17584));
         assert_eq!(CRC.checksum(b"123456789"), 0xcbf4_3926);
         let document = include_str!("../policy-format.md");
         for layer in Layer::ALL {
@@ -1063,9 +1254,12 @@ mod tests {
             (PERIOD_AT, "u32 | control period"),
             (RELAX_AT, "f32 | relaxation time"),
             (DIGEST_AT, "u32 | task digest"),
-            (MEAN_AT, "f32[40] | mean"),
-            (GAIN_AT, "f32[40] | gain"),
+            (MEMORY_AT, "u8 | memory"),
+            (RESERVED_2_AT, "u8[3] | reserved"),
+            (MEAN_AT, "f32[48] | mean"),
+            (GAIN_AT, "f32[48] | gain"),
             (SOFTMAX_AT, "i32 | softmax multiplier"),
+            (DISTANCE_AT, "i32[13] | distance bias"),
             (CRC_AT, "u32 | checksum"),
         ] {
             assert!(document.contains(&std::format!("| {at} | {field} |")), "{field}");
@@ -1100,18 +1294,25 @@ mod tests {
         };
         assert_eq!(said(0, b"ELF"), "this is not a policy image: it does not begin with COMPOSER");
         assert_eq!(
-            said(VERSION_AT, &[1]),
-            "the policy image has layout version 1, this build reads version 3: export the policy again"
+            said(VERSION_AT, &[3]),
+            "the policy image has layout version 3, this build reads version 4: export the policy again"
         );
-        assert!(
-            said(DIMENSIONS_AT + 2, &[128]).contains("dimensions [40, 128, 16, 32, 64, 2], this build runs [40, 64")
+        assert!(said(DIMENSIONS_AT + 2, &[128]).contains("dimensions [128, 16, 32, 64, 2], this build runs [64, 16"));
+        assert_eq!(
+            said(DIMENSIONS_AT, &[41]),
+            "the policy image holds a network of 41 inputs, this build knows the first 40 fields of the observation or all 48"
         );
-        assert_eq!(said(LENGTH_AT, &[0, 0]), "the policy image says it is 0 bytes long, layout version 3 is 14908");
+        assert_eq!(
+            said(MEMORY_AT, &[32]),
+            "the policy image holds a network with a memory of 32 channels, there is room for 16 or none"
+        );
+        assert_eq!(said(LENGTH_AT, &[0, 0]), "the policy image says it is 0 bytes long, layout version 4 is 17588");
         assert_eq!(said(TASK_AT, &[5]), "the policy image is for task 5, this build knows tasks 0 to 4");
         assert!(said(GOAL_KNOWN_TO_AT, &[2]).contains("2 in field `goal known to`"));
         assert!(said(ATTENTION_AT, &[2]).contains("`attention`"));
         assert!(said(FAULTS_AT, &[2]).contains("`trained with faults`"));
         assert!(said(RESERVED_AT, &[1]).contains("`reserved`"));
+        assert!(said(RESERVED_2_AT + 2, &[1]).contains("`reserved`"));
         let (nan, infinite) = (f32::NAN.to_le_bytes(), f32::INFINITY.to_le_bytes());
         assert!(said(LINKS_AT, &[5]).contains("links per module that is not a number from 2 to 4"));
         for (at, field) in [
@@ -1122,14 +1323,15 @@ mod tests {
             (LIMITS_AT + 12, "joint speed limit"),
             (LIMITS_AT + 16, "temperature limit"),
             (RELAX_AT, "relaxation time"),
-            (MEAN_AT + 4 * 39, "input mean"),
-            (GAIN_AT + 4 * 39, "input gain"),
+            (MEAN_AT + 4 * 47, "input mean"),
+            (GAIN_AT + 4 * 47, "input gain"),
         ] {
             assert!(said(at, &nan).contains(field) && said(at, &infinite).contains(field), "{field}");
         }
         assert!(said(PERIOD_AT, &[0; 4]).contains("control period that is not a number from 1000 to"));
         assert!(said(SOFTMAX_AT + 3, &[0x80]).contains("softmax multiplier"));
         assert!(said(SOFTMAX_AT + 4, &[0]).contains("shift that is not a number from 1 to 62"));
+        assert!(said(DISTANCE_AT + 4 * 12 + 3, &[0x40]).contains("distance bias that is not a number from -536870912"));
         assert!(said(Layer::Context.offset(), &[63]).contains("shift"));
 
         let mut image = random(4);
@@ -1138,7 +1340,7 @@ mod tests {
             Policy::parse(&image[..]).unwrap_err().to_string().starts_with("the policy image is damaged: its CRC-32")
         );
         let cut = Policy::parse(&image[..9000]).unwrap_err().to_string();
-        assert_eq!(cut, "the policy image is cut short: it has 9000 bytes where 14908 are needed");
+        assert_eq!(cut, "the policy image is cut short: it has 9000 bytes where 17588 are needed");
         let long: Vec<u8> = image.iter().copied().chain([0]).collect();
         assert!(Policy::parse(&long).unwrap_err().to_string().contains("too long"));
     }
@@ -1148,21 +1350,27 @@ mod tests {
         let mut image = Box::new([0; IMAGE_SIZE]);
         let good = Policy::parse(&random(1)[..]).unwrap().meta();
         let relax = Meta { relax_seconds: -1.0, ..good };
-        assert!(ImageWriter::new(&relax, &mut image).finish().is_err());
-        let mut writer = ImageWriter::new(&good, &mut image);
+        assert!(ImageWriter::new(&relax, Shape::BASE, &mut image).finish().is_err());
+        let mut writer = ImageWriter::new(&good, Shape::BASE, &mut image);
         writer.input(0, f32::NAN, 1.0);
         writer.input(1, 0.0, 1.0);
         assert!(writer.finish().is_err());
         assert!(Policy::parse(&image[..]).is_err());
-        let mut writer = ImageWriter::new(&good, &mut image);
+        let mut writer = ImageWriter::new(&good, Shape::BASE, &mut image);
         writer.softmax(-1, 5);
         assert!(writer.finish().is_err());
-        let mut writer = ImageWriter::new(&good, &mut image);
+        let mut writer = ImageWriter::new(&good, Shape::BASE, &mut image);
         writer.shift(Layer::Key, 0);
         assert!(writer.finish().is_err());
+        let mut writer = ImageWriter::new(&good, Shape::BASE, &mut image);
+        writer.distance(0, i32::MIN);
+        assert!(writer.finish().is_err());
+        assert!(ImageWriter::new(&good, Shape { inputs: 44, ..Shape::BASE }, &mut image).finish().is_err());
+        assert!(ImageWriter::new(&good, Shape { memory: 8, ..Shape::BASE }, &mut image).finish().is_err());
         // What does not exist is ignored.
-        let mut writer = ImageWriter::new(&good, &mut image);
+        let mut writer = ImageWriter::new(&good, Shape::BASE, &mut image);
         writer.input(OBS, f32::NAN, 0.0);
+        writer.distance(DISTANCE_BUCKETS, i32::MIN);
         writer.row(Layer::Output, OUT, 1, 1, &[1; 200]);
         writer.finish().unwrap();
         assert!(Policy::parse(&image[..]).is_ok());
@@ -1210,7 +1418,93 @@ mod tests {
             attention.iter().for_each(|x| digest.update(&x.to_le_bytes()));
             action.iter().for_each(|x| digest.update(&x.to_bits().to_le_bytes()));
         }
-        assert_eq!((policy.crc(), digest.finalize()), (2_627_758_852, 3_900_035_348));
+        assert_eq!((policy.crc(), digest.finalize()), (2_477_611_875, 3_900_035_348));
+    }
+
+    /// The same for memory, bias and the whole observation.
+    #[test]
+    fn the_bits_of_a_memory_are_pinned() {
+        let mut image = Box::new([0; IMAGE_SIZE]);
+        random_image_of(Shape::FULL, 7, &mut image);
+        let policy = Policy::parse(&image[..]).unwrap();
+        let (mut memories, mut digest) = ([Memory::EMPTY; 8], CRC.digest());
+        for step in 0..20 {
+            let mut latents = [Latent::ZERO; MAX_MODULES];
+            let observations = observations(7 + step);
+            let encoded: [Encoded; 8] = core::array::from_fn(|i| policy.encode(&mut memories[i], &observations[i]));
+            latents.iter_mut().zip(&encoded).for_each(|(to, from)| *to = from.latent);
+            for (i, own) in encoded.iter().enumerate() {
+                let action = policy.act(own, &latents, 0xff, None, i);
+                action.iter().for_each(|x| digest.update(&x.to_bits().to_le_bytes()));
+            }
+        }
+        assert_eq!((policy.crc(), digest.finalize()), (1_128_826_676, 3_867_806_610));
+    }
+
+    #[test]
+    fn buckets_of_distance_are_the_documented_ones() {
+        let away = [0, 1, 2, 3, 4, 5, 8, 9, 16, 17, 63];
+        assert_eq!(away.map(|j| distance_bucket(0, j)), [6, 7, 8, 9, 9, 10, 10, 11, 11, 12, 12]);
+        assert_eq!(away.map(|j| distance_bucket(j, 0)), [6, 5, 4, 3, 3, 2, 2, 1, 1, 0, 0]);
+        assert_eq!((distance_bucket(40, 37), distance_bucket(20, 21)), (3, 7));
+    }
+
+    /// A bias of the size of the logits' range decides alone whom a module attends to.
+    #[test]
+    fn a_bias_by_distance_turns_the_attention() {
+        let mut image = random(7);
+        let bias = DISTANCE_AT + 4 * distance_bucket(5, 3);
+        image[bias..bias + 4].copy_from_slice(&DISTANCE_BIAS_MAX.to_le_bytes());
+        seal(&mut image);
+        let policy = Policy::parse(&image[..]).unwrap();
+        assert!(policy.distance_bias() && !Policy::parse(&random(7)[..]).unwrap().distance_bias());
+        let (encoded, latents) = encode_all(&policy, &observations(3));
+        let mut attention = [0; MAX_MODULES];
+        policy.act(&encoded[5], &latents, 0xff, Some(&mut attention), 5);
+        assert!(attention[3] > 32000, "{attention:?}");
+        // Modules 4 and 3 lie towards the head of module 6 at the same distance as bucket 4 and 3.
+        policy.act(&encoded[4], &latents, 0b1000_0000, Some(&mut attention), 4);
+        assert!(attention[4] > 0 && attention[7] > 0, "nobody is two ahead: {attention:?}");
+    }
+
+    #[test]
+    fn a_memory_leaks_without_stalling_and_starts_empty() {
+        for now in [nn::ONE, -nn::ONE, 1, -1, 12_345] {
+            let mut memory = Memory::default();
+            let embedding = [now; EMBED];
+            let mut exact = [0.0f64; MEMORY];
+            for step in 0..400 {
+                memory.update(&embedding);
+                for (channel, (mean, got)) in exact.iter_mut().zip(memory.activations()).enumerate() {
+                    *mean += (f64::from(now) - *mean) / f64::from(1 << leak(channel));
+                    assert!(
+                        (*mean - f64::from(got)).abs() < 0.51,
+                        "{now}, step {step}, channel {channel}: {mean} {got}"
+                    );
+                }
+            }
+            assert_eq!(memory.activations(), [now; MEMORY]);
+        }
+        assert_eq!(Memory::default().activations(), [0; MEMORY]);
+    }
+
+    #[test]
+    fn a_memory_is_the_modules_own_and_only_where_the_network_has_one() {
+        let (base, mut full) = (random(5), Box::new([0; IMAGE_SIZE]));
+        random_image_of(Shape::FULL, 5, &mut full);
+        let (base, full) = (Policy::parse(&base[..]).unwrap(), Policy::parse(&full[..]).unwrap());
+        let [first, second, ..] = observations(5);
+        let mut memory = Memory::default();
+        let fresh = base.encode(&mut memory, &first);
+        assert_eq!((memory, base.encode(&mut memory, &first)), (Memory::EMPTY, fresh));
+        // Fields behind those it takes do not count.
+        let mut other = first;
+        other[observation::BASE..].fill(9.0);
+        assert_eq!(base.encode(&mut memory, &other), fresh);
+        let fresh = full.encode(&mut Memory::default(), &first);
+        assert_ne!(full.encode(&mut Memory::default(), &other), fresh);
+        full.encode(&mut memory, &second);
+        assert_ne!(full.encode(&mut memory, &first), fresh, "what was seen before counts");
     }
 
     #[test]
@@ -1222,7 +1516,7 @@ mod tests {
             let (encoded, latents) = encode_all(&policy, &observations(seed));
             let actions = core::array::from_fn::<_, 8, _>(|i| policy.act(&encoded[i], &latents, 0xff, None, i));
             assert!(actions.iter().any(|a| *a != actions[0]));
-            let saturated = encoded.iter().flat_map(|e| e.embedding).filter(|e| e.abs() == nn::ONE).count();
+            let saturated = encoded.iter().flat_map(|e| e.features).filter(|e| e.abs() == nn::ONE).count();
             assert!(saturated < 50, "{saturated} of 512");
             let mut attention = [0; MAX_MODULES];
             policy.act(&encoded[0], &latents, 0xff, Some(&mut attention), 0);
@@ -1236,10 +1530,11 @@ mod tests {
     fn nonsense_in_an_observation_becomes_something_finite() {
         let image = random(8);
         let policy = Policy::parse(&image[..]).unwrap();
-        let nan = policy.encode(&[f32::NAN; OBS]);
-        assert_eq!(nan, policy.encode(&[0.0; OBS]), "the means are 0");
-        assert_eq!(policy.encode(&[f32::INFINITY; OBS]), policy.encode(&[5.0; OBS]));
-        assert_eq!(policy.encode(&[f32::NEG_INFINITY; OBS]), policy.encode(&[-1e9; OBS]));
+        let nan = policy.encode(&mut Memory::default(), &[f32::NAN; OBS]);
+        assert_eq!(nan, policy.encode(&mut Memory::default(), &[0.0; OBS]), "the means are 0");
+        let encode = |x| policy.encode(&mut Memory::default(), &[x; OBS]);
+        assert_eq!(encode(f32::INFINITY), encode(5.0));
+        assert_eq!(encode(f32::NEG_INFINITY), encode(-1e9));
         let action = policy.act(&nan, &[Latent::ZERO; MAX_MODULES], u64::MAX, None, usize::MAX);
         assert!(action.iter().all(|a| a.is_finite()));
     }
@@ -1296,6 +1591,10 @@ mod tests {
                 image[at] = if seed % 3 == 0 { [0x80, 0x7f][(state & 1) as usize] } else { state as u8 };
             }
             image[SOFTMAX_AT + 3] &= 0x7f;
+            for bucket in 0..DISTANCE_BUCKETS {
+                image[DISTANCE_AT + 4 * bucket + 3] = [0x1f, 0xe0][bucket % 2];
+            }
+            image[MEMORY_AT] = [0, MEMORY as u8][seed as usize % 2];
             for at in Layer::ALL.map(Layer::offset).into_iter().chain([SOFTMAX_AT + 4]) {
                 state = state.rotate_left(17).wrapping_mul(5);
                 let shift = 1 + (state % 62) as u32;
@@ -1303,9 +1602,12 @@ mod tests {
             }
             seal(&mut image);
             let policy = Policy::parse(&image[..]).unwrap();
-            let own = policy.encode(&observations(seed as u32)[0]);
-            let action = policy.act(&own, &others, heard, None, seed as usize % 70);
-            prop_assert!(action.iter().all(|a| a.abs() <= 1.0));
+            let mut memory = Memory::default();
+            for observation in observations(seed as u32) {
+                let own = policy.encode(&mut memory, &observation);
+                let action = policy.act(&own, &others, heard, None, seed as usize % 70);
+                prop_assert!(action.iter().all(|a| a.abs() <= 1.0));
+            }
         }
 
         #[test]
@@ -1314,7 +1616,7 @@ mod tests {
         ) {
             let image = random(seed);
             let policy = Policy::parse(&image[..]).unwrap();
-            let own = policy.encode(&observations(seed)[0]);
+            let own = policy.encode(&mut Memory::default(), &observations(seed)[0]);
             let mut attention = [7; MAX_MODULES];
             let action = policy.act(&own, &others, heard, Some(&mut attention), own_index);
             prop_assert_eq!(policy.act(&own, &others, heard, None, own_index), action);

@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use composer_firmware::controller::BusKind;
 use composer_shared::observation::{SIZE, Sensors};
-use composer_shared::policy::{IMAGE_SIZE, Latent, Policy, random_image};
+use composer_shared::policy::{IMAGE_SIZE, Latent, Memory, Policy, random_image};
 use composer_shared::robot::MAX_MODULES;
 use composer_sim_bridge::Plant;
 use composer_sim_bridge::sil::{SilConfig, run};
@@ -62,9 +62,9 @@ fn policy_us(image: &[u8], modules: usize) -> f64 {
     let latents = [Latent::ZERO; MAX_MODULES];
     let (clock, rounds) = (Instant::now(), 20_000);
     let start = cpu_seconds(clock);
-    let mut sum = 0.0;
+    let (mut sum, mut memory) = (0.0, Memory::EMPTY);
     for round in 0..rounds {
-        let encoded = policy.encode(&[round as f32 * 1e-3; SIZE]);
+        let encoded = policy.encode(&mut memory, &[round as f32 * 1e-3; SIZE]);
         sum += policy.act(&encoded, &latents, heard, None, 0)[0];
     }
     std::hint::black_box(sum);

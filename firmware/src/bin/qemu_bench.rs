@@ -22,9 +22,9 @@ use composer_firmware::storage::RamFlash;
 use composer_firmware::supply::Extremes;
 use composer_shared::kinematics::Chain;
 use composer_shared::nn::Dense;
-use composer_shared::observation::{Seeker, Sensors, Told, observe};
+use composer_shared::observation::{Motors, Seeker, Sensors, Told, observe};
 use composer_shared::policies;
-use composer_shared::policy::{Latent, Policy};
+use composer_shared::policy::{Latent, Memory, Policy};
 use composer_shared::registers::Register;
 use composer_shared::robot::{Geometry, MAX_MODULES};
 use composer_shared::wire::{
@@ -128,17 +128,18 @@ fn parts(policy: &Policy<'_>, random: &mut Random) {
     let told = Told { points, seeker: Seeker::Head };
     report(
         format_args!("observation"),
-        count(|| observe(black_box(&sensors), 0.5, black_box(&head), black_box(&told))),
+        count(|| observe(black_box(&sensors), &Motors::SOUND, 0.5, black_box(&head), black_box(&told))),
     );
 
     let mut attitude = Attitude::rested(sensors.up);
     let instructions = count(|| attitude.update(black_box(sensors.angular_rate), black_box([0.3, 0.1, 1.2]), 1e-3));
     report(format_args!("attitude"), instructions);
 
-    let observation = observe(&sensors, 0.5, &head, &told);
-    report(format_args!("encode"), count(|| policy.encode(black_box(&observation))));
+    let observation = observe(&sensors, &Motors::SOUND, 0.5, &head, &told);
+    let mut memory = Memory::EMPTY;
+    report(format_args!("encode"), count(|| policy.encode(&mut memory, black_box(&observation))));
 
-    let own = policy.encode(&observation);
+    let own = policy.encode(&mut memory, &observation);
     let latents = [(); MAX_MODULES].map(|()| random.latent());
     let mut attend = 0;
     for modules in [8, 16, 32, 64] {
@@ -168,7 +169,7 @@ fn dense(random: &mut Random) {
     let multipliers = [(); 64].map(|()| [random.byte(), random.byte(), random.byte(), 0x40]);
     let bias = [(); 64].map(|()| [random.byte(), random.byte(), 0, 0]);
     let input = [(); 64].map(|()| i16::from_le_bytes([random.byte(), random.byte()]).max(-32767));
-    let layer = Dense { weights: &weights, multipliers: &multipliers, bias: Some(&bias), shift: 37 };
+    let layer = Dense { weights: &weights, multipliers: &multipliers, bias: Some(&bias), shift: 37, columns: 64 };
     let mut out = [0; 64];
     report(format_args!("dense64/dsp"), count(|| black_box(&layer).forward(black_box(&input), black_box(&mut out))));
     report(

@@ -6,7 +6,7 @@ use std::string::ToString;
 use std::vec;
 use std::vec::Vec;
 
-use composer_shared::policy::{IMAGE_SIZE, Task, random_image};
+use composer_shared::policy::{IMAGE_SIZE, Shape, Task, random_image, random_image_of};
 use composer_shared::wire::{ALL_MODULES, Function};
 use proptest::prelude::*;
 
@@ -31,6 +31,12 @@ fn policy(seed: u32, patch: &[(usize, u8)]) -> Policy<'static> {
         (0..8).fold(crc ^ u32::from(*byte), |crc, _| crc >> 1 ^ if crc & 1 != 0 { 0xedb8_8320 } else { 0 })
     });
     checksum.copy_from_slice(&(!crc).to_le_bytes());
+    Policy::parse(image).unwrap()
+}
+
+fn with_memory() -> Policy<'static> {
+    let image = Box::leak(Box::new([0; IMAGE_SIZE]));
+    random_image_of(Shape::FULL, 3, image);
     Policy::parse(image).unwrap()
 }
 
@@ -290,6 +296,7 @@ fn the_torques_are_those_of_the_training_loop_to_the_last_bit() {
         (BusKind::Fd, policy(7, &[])),
         (BusKind::Classic, policy(7, &[])),
         (BusKind::Fd, without_attention()),
+        (BusKind::Fd, with_memory()),
         (BusKind::Fd, of_task(Task::ShapeFormation)),
         (BusKind::Classic, of_task(Task::TubeCrossing)),
     ] {
@@ -299,6 +306,7 @@ fn the_torques_are_those_of_the_training_loop_to_the_last_bit() {
         net.plug(2);
         let mut chain = Chain::new(policy.geometry());
         let mut torques = [[0.0f32; 2]; 5];
+        let mut memories = [Memory::EMPTY; 5];
         let relax = relax_factor(50_000, policy.relax_seconds());
         for cycle in 0..30 {
             let started = net.at(3).stats().cycles;
@@ -327,7 +335,10 @@ fn the_torques_are_those_of_the_training_loop_to_the_last_bit() {
             let encoded: [Encoded; 5] = core::array::from_fn(|i| {
                 let points = policy.task().observed(i as u8, 5).map(|number| number.and_then(point));
                 let told = Told { points, seeker: policy.task().seeker() };
-                policy.encode(&observe(&net.sensors[i], place(i, 5), &chain.head_seen_from(i), &told))
+                let commanded = torques[i].map(|torque| torque / policy.limits().torque);
+                let motors = Motors { commanded, ..Motors::SOUND };
+                let head = chain.head_seen_from(i);
+                policy.encode(&mut memories[i], &observe(&net.sensors[i], &motors, place(i, 5), &head, &told))
             });
             let mut latents = [Default::default(); ROOM];
             let mut plausible = 0;

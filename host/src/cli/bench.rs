@@ -16,7 +16,7 @@ use crate::environment::{Environment, Told, Trivial, View};
 use crate::eval::{DEFAULT_SEED, episode_seed, parallel};
 use crate::methods::{Differentiation, Method, Times, TrainConfig, mix};
 use crate::mjcf::mjcf;
-use crate::policy::{Policy, Random};
+use crate::policy::{Memories, Policy, Random};
 use crate::robot::{Robot, Solver};
 use crate::run::RunConfig;
 use crate::sil::SnakePlant;
@@ -56,7 +56,7 @@ fn physics(task: Task, robot: &Robot, threads: usize, seconds: f64) -> f64 {
         let (start, mut steps, mut seed) = (Instant::now(), 0u64, thread as u64);
         while start.elapsed().as_secs_f64() < seconds {
             env.view(&mut view);
-            Random.act(&view, seed ^ steps, &mut actions, None);
+            Random.act(&view, seed ^ steps, &mut Memories::default(), &mut actions, None);
             let outcome = env.step(&actions);
             steps += 1;
             if outcome.terminated || outcome.truncated {

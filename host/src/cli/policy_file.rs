@@ -234,7 +234,7 @@ fn check(policy: &Policy, robot: &Robot) -> Result<()> {
 mod tests {
     use super::*;
     use composer_shared::policies;
-    use composer_shared::policy::{IMAGE_SIZE, ImageWriter, Meta, random_image};
+    use composer_shared::policy::{IMAGE_SIZE, ImageWriter, Meta, Shape, random_image};
 
     /// An image that says it was trained for this task.
     fn image(task: &TaskConfig, digest: u32) -> Vec<u8> {
@@ -243,7 +243,7 @@ mod tests {
         let meta = Policy::parse(&image).unwrap().meta();
         let limits = Robot::default().limits();
         let meta = Meta { task: task.task(), task_digest: digest, limits, ..meta };
-        let mut writer = ImageWriter::new(&meta, &mut image);
+        let mut writer = ImageWriter::new(&meta, Shape::FULL, &mut image);
         (0..composer_shared::policy::OBS).for_each(|field| writer.input(field, 0.0, 1.0));
         writer.finish().unwrap();
         image.to_vec()

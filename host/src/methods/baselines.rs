@@ -19,7 +19,7 @@ use super::smp::SmpPolicy;
 use super::tensors::{Weights, floats};
 use super::{Algorithm, MakeEnvironment, Method, checked};
 use crate::environment::View;
-use crate::policy::Policy;
+use crate::policy::{Memories, Policy};
 
 /// Declares the settings of a baseline, with its authors' as defaults.
 macro_rules! settings {
@@ -343,7 +343,14 @@ impl<'a, N: TensorNetworks> TensorPolicy<'a, N> {
 }
 
 impl<N: TensorNetworks> Policy for TensorPolicy<'_, N> {
-    fn act(&self, view: &View, _noise: u64, actions: &mut Vec<[f32; 2]>, _attention: Option<&mut Vec<f32>>) {
+    fn act(
+        &self,
+        view: &View,
+        _noise: u64,
+        _memories: &mut Memories,
+        actions: &mut Vec<[f32; 2]>,
+        _attention: Option<&mut Vec<f32>>,
+    ) {
         let all = view.observations.len();
         // Modules beyond those that the networks are made for hang limp.
         let n = self.networks.most_modules().map_or(all, |most| all.min(most));

@@ -26,7 +26,6 @@ mod tests;
 use std::path::Path;
 
 use anyhow::{Context, Result, bail};
-use composer_shared::observation::SIZE;
 use serde::{Deserialize, Serialize};
 
 use self::actor::{Actor, ActorLayout, ActorScratch, Remembered, Shape, log_probability};
@@ -233,11 +232,7 @@ impl ActorCritic for Networks {
     }
 
     fn policy(&self, mean: &[f32], std: &[f32]) -> TrainedPolicy {
-        // Numbers that it does not take are not normalised.
-        let [mut means, mut stds] = [[0.0; SIZE], [1.0; SIZE]];
-        means[..mean.len()].copy_from_slice(mean);
-        stds[..std.len()].copy_from_slice(std);
-        TrainedPolicy::Composer(Box::new(self.actor.layout().network(self.actor.parameters(), means, stds)))
+        TrainedPolicy::Composer(Box::new(self.actor.layout().network(self.actor.parameters(), mean, std)))
     }
 }
 

@@ -2,12 +2,12 @@
 
 use anyhow::{Result, bail};
 use composer_shared::observation::{BASE, SIZE};
+use composer_shared::policy::MEMORY;
 use serde::{Deserialize, Serialize};
 
 use super::Method;
 use super::baselines::{MappoConfig, MatConfig, MatDecConfig, PpoConfig};
 use super::composer::Differentiation;
-use super::composer::actor::MEMORY;
 use super::curriculum::{CurriculumConfig, SecondStage};
 use super::imagination::ImaginationConfig;
 use super::on_policy::update::RATE_LIMITS;

@@ -31,7 +31,7 @@ use super::random::{Stream, stream};
 use super::tensors::{Activation, Layout, Scheme, Weights, floats};
 use super::{MakeEnvironment, Method, SavedWeights, TrainedPolicy};
 use crate::environment::View;
-use crate::policy::Policy;
+use crate::policy::{Memories, Policy};
 
 /// Numbers in a message.
 const MESSAGE: usize = 32;
@@ -287,7 +287,14 @@ impl SmpPolicy {
 }
 
 impl Policy for SmpPolicy {
-    fn act(&self, view: &View, _noise: u64, actions: &mut Vec<[f32; 2]>, _attention: Option<&mut Vec<f32>>) {
+    fn act(
+        &self,
+        view: &View,
+        _noise: u64,
+        _memories: &mut Memories,
+        actions: &mut Vec<[f32; 2]>,
+        _attention: Option<&mut Vec<f32>>,
+    ) {
         let modules = view.observations.len();
         let heard: Vec<u64> = view.heard.iter().enumerate().map(|(module, heard)| heard | 1 << module).collect();
         let seen = seen(&self.actor, &raw(view), &heard, modules);

@@ -271,6 +271,7 @@ mod tests {
     use crate::methods::Method;
     use crate::methods::baselines::{MappoConfig, MatConfig};
     use crate::methods::imagination::ImaginationConfig;
+    use crate::policy::Memories;
     use crate::robot::Robot;
     use composer_shared::policy::Task;
 
@@ -417,7 +418,7 @@ mod tests {
                 team.reset(1);
                 team.view(&mut view);
                 let mut actions = Vec::new();
-                read.policy().act(&view, 0, &mut actions, None);
+                read.policy().act(&view, 0, &mut Memories::default(), &mut actions, None);
                 assert_eq!(actions.len(), modules);
                 assert!(actions.as_flattened().iter().all(|a| a.is_finite()), "{method}");
             }
@@ -526,7 +527,7 @@ mod tests {
             .map(|seed| {
                 team.reset(seed);
                 team.view(&mut view);
-                decides.act(&view, 0, &mut actions, None);
+                decides.act(&view, 0, &mut Memories::default(), &mut actions, None);
                 team.step(&actions).reward
             })
             .sum();

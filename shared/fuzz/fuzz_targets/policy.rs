@@ -2,17 +2,20 @@
 #![no_main]
 
 use composer_shared::observation::SIZE;
-use composer_shared::policy::{IMAGE_SIZE, Latent, Policy, random_image};
+use composer_shared::policy::{IMAGE_SIZE, Latent, Memory, Policy, random_image};
 use composer_shared::robot::MAX_MODULES;
 use libfuzzer_sys::fuzz_target;
 
 fn run(image: &[u8]) {
     match Policy::parse(image) {
         Ok(policy) => {
-            let own = policy.encode(&[0.5; SIZE]);
+            let mut memory = Memory::EMPTY;
             let latents = [Latent { key: [-128; 16], value: [127; 32] }; MAX_MODULES];
-            let action = policy.act(&own, &latents, u64::MAX, None, 0);
-            assert!(action.iter().all(|a| (-1.01..=1.01).contains(a)));
+            for x in [0.5, f32::MAX, -1.0] {
+                let own = policy.encode(&mut memory, &[x; SIZE]);
+                let action = policy.act(&own, &latents, u64::MAX, None, 0);
+                assert!(action.iter().all(|a| (-1.01..=1.01).contains(a)));
+            }
         }
         Err(error) => assert!(!error.to_string().is_empty()),
     }

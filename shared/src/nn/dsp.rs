@@ -67,17 +67,18 @@ fn pair(low: i16, high: i16) -> u32 {
     u32::from(low as u16) | u32::from(high as u16) << 16
 }
 
-/// Four sums at once, so that an activation is loaded once for four products. 21 instructions for 16 products, and 2 more where
-/// the loop goes round.
+/// Four sums at once over the first `turns` turns of the loop, so that an activation is loaded once for four products. 21 instructions for
+/// 16 products, and 2 more where the loop goes round.
 ///
 /// It is one block because the compiler, given the instructions singly, orders them so that it runs out of registers.
 #[inline(always)]
-fn four_rows<const IN: usize>(weights: &[[u8; IN]; 4], input: &Shuffled<IN>) -> [i32; 4] {
+fn four_rows<const IN: usize>(weights: &[[u8; IN]; 4], input: &Shuffled<IN>, turns: usize) -> [i32; 4] {
     const { assert!(IN > 0 && IN.is_multiple_of(4) && 3 * IN < 4096, "rows are not whole words, or too far apart") };
     let (mut a, mut b, mut c, mut d) = (0, 0, 0, 0);
-    // SAFETY: reads the IN columns of all four rows, four bytes at a time, and as many activations; as IN is a multiple of 4 and
-    // of the columns between two turns of the loop, it ends where they end. LDR may be unaligned; LDRD must not, and `Shuffled`
-    // is aligned. The sums wrap, and nobody reads the Q flag that says so.
+    let turns = turns.clamp(1, IN / turn(IN));
+    // SAFETY: reads the first columns of all four rows, four bytes at a time, and as many activations. They end after a whole number of turns
+    // of the loop, at least one and no more than the IN columns have, so the pointers meet. LDR may be unaligned; LDRD must not, and
+    // `Shuffled` is aligned. The sums wrap, and nobody reads the Q flag that says so.
     unsafe {
         asm!(
             "2:",
@@ -106,12 +107,12 @@ fn four_rows<const IN: usize>(weights: &[[u8; IN]; 4], input: &Shuffled<IN>) -> 
             ".endr",
             "cmp {input}, {end}",
             "bne 2b",
-            unrolled = const unrolled(IN / 4),
+            unrolled = const turn(IN) / 4,
             row1 = const IN - 4,
             row2 = const 2 * IN - 4,
             row3 = const 3 * IN - 4,
             input = inout(reg) input.0.as_ptr() => _,
-            end = in(reg) input.0.as_ptr_range().end,
+            end = in(reg) input.0.as_ptr().add(turns * turn(IN)),
             row = inout(reg) weights.as_ptr() => _,
             even = out(reg) _,
             odd = out(reg) _,
@@ -127,14 +128,14 @@ fn four_rows<const IN: usize>(weights: &[[u8; IN]; 4], input: &Shuffled<IN>) -> 
     [a, b, c, d]
 }
 
-/// How many groups of four columns to take between two branches: a divisor of `groups`.
-const fn unrolled(groups: usize) -> usize {
-    if groups.is_multiple_of(4) {
-        4
-    } else if groups.is_multiple_of(3) {
-        3
+/// How many of so many columns to take between two branches: whole words, and a divisor.
+const fn turn(columns: usize) -> usize {
+    if columns.is_multiple_of(16) {
+        16
+    } else if columns.is_multiple_of(12) {
+        12
     } else {
-        1
+        4
     }
 }
 
@@ -148,16 +149,17 @@ fn one_row<const IN: usize>(weights: &[u8; IN], input: &Shuffled<IN>) -> i32 {
     })
 }
 
-/// [`super::accumulate_portable`]. One copy of the code for all layers of the same width: of slices, so that the compiler cannot
-/// unroll the rows as well.
+/// [`super::accumulate_portable`] where all inputs but the first `columns` are zero. One copy of the code for all layers of the same width: of
+/// slices, so that the compiler cannot unroll the rows as well.
 #[inline(never)]
-pub(super) fn accumulate<const IN: usize>(weights: &[[u8; IN]], input: &[i16; IN], sums: &mut [i32]) {
+pub(super) fn accumulate<const IN: usize>(weights: &[[u8; IN]], input: &[i16; IN], sums: &mut [i32], columns: usize) {
     let mut shuffled = Shuffled([[0; 2]; IN]);
     shuffled.fill(input);
     let (blocks, rest) = sums.as_chunks_mut::<4>();
     let (weights, last_weights) = weights.as_chunks::<4>();
+    let turns = columns.div_ceil(turn(IN));
     for (sums, weights) in blocks.iter_mut().zip(weights) {
-        *sums = four_rows(weights, &shuffled);
+        *sums = four_rows(weights, &shuffled, turns);
     }
     for (sum, weights) in rest.iter_mut().zip(last_weights) {
         *sum = one_row(weights, &shuffled);

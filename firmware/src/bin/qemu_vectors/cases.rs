@@ -6,8 +6,10 @@
 use composer_shared::kinematics::Chain;
 use composer_shared::math::sin_cos;
 use composer_shared::nn::{self, Dense, Query};
-use composer_shared::observation::{Seeker, Sensors, Told, observe};
-use composer_shared::policy::{IMAGE_SIZE, ImageWriter, Latent, Layer, Meta, OBS, Policy, random_image};
+use composer_shared::observation::{Motors, Seeker, Sensors, Told, observe};
+use composer_shared::policy::{
+    DISTANCE_BUCKETS, FEATURES, IMAGE_SIZE, ImageWriter, Latent, Layer, Memory, Meta, OBS, Policy, Shape, random_image,
+};
 use composer_shared::robot::{Geometry, MAX_MODULES};
 use nalgebra::Vector3;
 
@@ -81,6 +83,9 @@ struct Misaligned<const PAD: usize, T> {
 /// All cases once.
 pub fn round(side: &mut impl Side) {
     // The layers of the network, and widths that the kernels treat apart: 1, 2, 3 and 4 groups of inputs a turn, rows left over.
+    dense::<48, 64, 0>(side, "dense 48 x 64");
+    dense::<80, 64, 0>(side, "dense 80 x 64");
+    dense::<80, 16, 1>(side, "dense 80 x 16, at an odd address");
     dense::<28, 64, 0>(side, "dense 28 x 64");
     dense::<36, 64, 0>(side, "dense 36 x 64");
     dense::<64, 16, 0>(side, "dense 64 x 16");
@@ -111,8 +116,11 @@ fn dense<const IN: usize, const OUT: usize, const PAD: usize>(side: &mut impl Si
     // Shifts of trained layers are 35 to 48.
     let shift = if side.byte() & 3 == 0 { side.byte() } else { side.within(33, 62) };
     let bias = (side.byte() & 1 == 0).then_some(&bias);
-    let input = side.i16s();
-    let layer = Dense { weights: &weights.value, multipliers: &multipliers, bias, shift };
+    let mut input = side.i16s::<IN>();
+    // Now and then only the first inputs count.
+    let columns = if side.byte() & 3 == 0 { IN.min(1 + side.byte() as usize) } else { IN };
+    input.iter_mut().skip(columns).for_each(|x| *x = 0);
+    let layer = Dense { weights: &weights.value, multipliers: &multipliers, bias, shift, columns };
     let mut out = [0; OUT];
     layer.forward(&input, &mut out);
     side.words(case, out.map(|v| v as u32));
@@ -185,7 +193,12 @@ fn kinematics(side: &mut impl Side) {
         (side.byte() & 7 != 0).then_some(point)
     });
     let seeker = if side.byte() & 1 == 0 { Seeker::Head } else { Seeker::Each };
-    let observation = observe(&sensors, side.float(), &head, &Told { points, seeker });
+    let motors = Motors {
+        commanded: [(); 2].map(|()| side.float()),
+        work: [(); 2].map(|()| side.byte() & 1 == 0),
+        beside: [(); 2].map(|()| side.float()),
+    };
+    let observation = observe(&sensors, &motors, side.float(), &head, &Told { points, seeker });
     side.words("observation", observation.map(f32::to_bits));
 }
 
@@ -193,11 +206,15 @@ fn kinematics(side: &mut impl Side) {
 fn policy(side: &mut impl Side) {
     let mut image = [0; IMAGE_SIZE];
     let meta = random_meta(&mut image);
-    let mut writer = ImageWriter::new(&meta, &mut image);
+    let shape = if side.byte() & 1 == 0 { Shape::FULL } else { Shape::BASE };
+    let mut writer = ImageWriter::new(&meta, shape, &mut image);
     for field in 0..OBS {
         writer.input(field, side.float(), side.float().abs() * 200.0);
     }
     writer.softmax(side.i32() & i32::MAX, side.within(28, 36));
+    for bucket in 0..DISTANCE_BUCKETS {
+        writer.distance(bucket, side.i32() >> 8);
+    }
     for layer in Layer::ALL {
         // Such that most results are neither nothing nor saturated.
         let scale = match layer {
@@ -208,7 +225,7 @@ fn policy(side: &mut impl Side) {
         writer.shift(layer, side.within(scale - 3, scale + 4));
         for output in 0..layer.outputs() {
             let (multiplier, bias) = (side.i32(), side.i32() >> side.within(8, 24));
-            let weights = side.i8s::<64>();
+            let weights = side.i8s::<FEATURES>();
             writer.row(layer, output, multiplier, bias, weights.get(..layer.inputs()).unwrap_or_default());
         }
     }
@@ -217,9 +234,10 @@ fn policy(side: &mut impl Side) {
         return side.result("a policy image that is refused", &[u8::from(valid)]);
     };
     let mut latents = [Latent::ZERO; MAX_MODULES];
+    let mut memory = Memory::EMPTY;
     for _ in 0..4 {
         let observation = [(); OBS].map(|()| side.float());
-        let own = policy.encode(&observation);
+        let own = policy.encode(&mut memory, &observation);
         side.result("encode", &own.latent.key.map(|v| v as u8));
         side.result("encode", &own.latent.value.map(|v| v as u8));
         for _ in 0..16 {

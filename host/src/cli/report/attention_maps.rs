@@ -10,7 +10,7 @@ use crate::environment::{Environment, View};
 use crate::eval::{DEFAULT_SEED, episode_seed};
 use crate::files::write_whole;
 use crate::plot::{Heatmap, MapWords, heatmaps};
-use crate::policy::Policy;
+use crate::policy::{Memories, Policy};
 use crate::run::RunConfig;
 
 /// Matrices in the figure, evenly over the episode.
@@ -49,10 +49,11 @@ fn successful(env: &Arc<crate::env::EnvConfig>, policy: &dyn Policy, seed: u64) 
     let mut env = SnakeEnv::new(env.clone());
     env.reset_with(seed, &[]);
     let (mut view, mut actions, mut matrices) = (View::default(), Vec::new(), Vec::new());
+    let mut memories = Memories::default();
     loop {
         let mut attention = Vec::new();
         env.view(&mut view);
-        policy.act(&view, 0, &mut actions, Some(&mut attention));
+        policy.act(&view, 0, &mut memories, &mut actions, Some(&mut attention));
         if attention.is_empty() {
             bail!("the policy has no attention to draw");
         }

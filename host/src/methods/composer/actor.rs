@@ -17,9 +17,9 @@
 //! Plain f32 over whole teams, no tensor library, no allocation once the working memory has grown. What a module does depends on its own
 //! team alone, bit for bit: a batch of many teams and a rollout of one agree.
 
-use composer_shared::observation::{BASE, SIZE};
-use composer_shared::policy::OUT;
-pub use composer_shared::policy::{EMBED, HIDDEN, KEY, VALUE};
+use composer_shared::observation::BASE;
+use composer_shared::policy::{DISTANCE_BUCKETS, OUT, distance_bucket, leak};
+pub use composer_shared::policy::{EMBED, HIDDEN, KEY, MEMORY, VALUE};
 
 use crate::methods::kernels::{Start, bias_tanh_backward, dense, dense_weights, dot, head, head_backward, tanh};
 use crate::methods::on_policy::{Batch, Gradient, LossSettings};
@@ -28,35 +28,16 @@ use crate::methods::random::{Stream, stream};
 use crate::methods::simd::{Vector, vectorise};
 use crate::network::{Dense, Network};
 
-/// Channels of a memory, if there is one.
-pub const MEMORY: usize = 16;
-/// Share of the way to the embedding that each channel goes in a control step: the first half remembers some 4 steps, the other some 16.
+/// Share of the way to the embedding that each channel of the memory goes in a control step.
 pub const LEAKS: [f32; MEMORY] = {
-    let mut leaks = [1.0 / 16.0; MEMORY];
+    let mut leaks = [0.0; MEMORY];
     let mut channel = 0;
-    while channel < MEMORY / 2 {
-        leaks[channel] = 1.0 / 4.0;
+    while channel < MEMORY {
+        leaks[channel] = 1.0 / (1 << leak(channel)) as f32;
         channel += 1;
     }
     leaks
 };
-
-/// Which number of the bias of distance holds for a module that attends to another.
-pub const DISTANCE_BUCKETS: usize = 13;
-
-/// The number of the bias for how far behind `from` a module `to` is along the chain: the same, 1, 2, up to 4, 8, 16 and beyond, in front and behind.
-pub fn distance_bucket(from: usize, to: usize) -> usize {
-    let size = match from.abs_diff(to) {
-        0 => 0,
-        1 => 1,
-        2 => 2,
-        3..=4 => 3,
-        5..=8 => 4,
-        9..=16 => 5,
-        _ => 6,
-    };
-    if to >= from { 6 + size } else { 6 - size }
-}
 
 /// What an actor is made of.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -76,7 +57,13 @@ pub struct Shape {
 impl Shape {
     /// That of a network.
     pub fn of(network: &Network) -> Self {
-        Self::paper(network.attention, OUT)
+        Self {
+            attention: network.attention,
+            outputs: OUT,
+            inputs: network.inputs,
+            memory: network.memory,
+            distance_bias: network.attention && !network.distance_bias.is_empty(),
+        }
     }
 
     /// The paper's: the first numbers of the observation, no memory, no bias.
@@ -228,42 +215,48 @@ impl ActorLayout {
         if !self.attention.is_empty() {
             put(self.attention, &[&network.query.weights[..], &network.key.weights, &network.value.weights].concat());
         }
+        if !self.distance_bias.is_empty() {
+            put(self.distance_bias, &network.distance_bias);
+        }
         put(self.hidden_bias, &network.hidden.bias);
         put(self.output, &network.output.weights);
         put(self.output_bias, &network.output.bias);
-        let context = self.hidden_context.columns;
-        for (row, weights) in network.hidden.weights.chunks_exact(EMBED + VALUE).enumerate() {
-            p[self.hidden.offset + row * EMBED..][..EMBED].copy_from_slice(&weights[..EMBED]);
-            p[self.hidden_context.offset + row * context..][..context]
-                .copy_from_slice(&weights[EMBED..EMBED + context]);
+        let (features, context) = (self.features(), self.hidden_context.columns);
+        for (row, weights) in network.hidden.weights.chunks_exact(features + VALUE).enumerate() {
+            let (of_features, of_context) = weights.split_at(features);
+            p[self.hidden.offset + row * features..][..features].copy_from_slice(of_features);
+            p[self.hidden_context.offset + row * context..][..context].copy_from_slice(&of_context[..context]);
         }
         p
     }
 
-    /// The network that these parameters of a control policy are, with the statistics of its observations.
-    pub fn network(&self, parameters: &[f32], mean: [f32; SIZE], std: [f32; SIZE]) -> Network {
+    /// The network that these parameters of a control policy are, with the statistics of the observations that it takes.
+    pub fn network(&self, parameters: &[f32], mean: &[f32], std: &[f32]) -> Network {
         let dense =
             |weights: Vec<f32>, inputs: usize, outputs: usize, bias: Vec<f32>| Dense { inputs, outputs, weights, bias };
         let part = |block: Block| parameters[block.range()].to_vec();
         let attention = !self.attention.is_empty();
-        let qkv = if attention { part(self.attention) } else { vec![0.0; (2 * KEY + VALUE) * EMBED] };
-        let mut hidden = vec![0.0; HIDDEN * (EMBED + VALUE)];
-        for row in 0..HIDDEN {
-            let to = &mut hidden[row * (EMBED + VALUE)..][..EMBED + VALUE];
-            to[..EMBED].copy_from_slice(&parameters[self.hidden.offset + row * EMBED..][..EMBED]);
+        let features = self.features();
+        let qkv = if attention { part(self.attention) } else { vec![0.0; (2 * KEY + VALUE) * features] };
+        let mut hidden = vec![0.0; HIDDEN * (features + VALUE)];
+        for (row, to) in hidden.chunks_exact_mut(features + VALUE).enumerate() {
+            to[..features].copy_from_slice(&parameters[self.hidden.offset + row * features..][..features]);
             if attention {
-                to[EMBED..].copy_from_slice(&parameters[self.hidden_context.offset + row * VALUE..][..VALUE]);
+                to[features..].copy_from_slice(&parameters[self.hidden_context.offset + row * VALUE..][..VALUE]);
             }
         }
         Network {
             attention,
-            mean,
-            std,
-            encoder: dense(part(self.encoder), SIZE, EMBED, part(self.encoder_bias)),
-            query: dense(qkv[..KEY * EMBED].to_vec(), EMBED, KEY, Vec::new()),
-            key: dense(qkv[KEY * EMBED..2 * KEY * EMBED].to_vec(), EMBED, KEY, Vec::new()),
-            value: dense(qkv[2 * KEY * EMBED..].to_vec(), EMBED, VALUE, Vec::new()),
-            hidden: dense(hidden, EMBED + VALUE, HIDDEN, part(self.hidden_bias)),
+            inputs: self.inputs(),
+            memory: self.memory(),
+            distance_bias: part(self.distance_bias),
+            mean: mean.to_vec(),
+            std: std.to_vec(),
+            encoder: dense(part(self.encoder), self.inputs(), EMBED, part(self.encoder_bias)),
+            query: dense(qkv[..KEY * features].to_vec(), features, KEY, Vec::new()),
+            key: dense(qkv[KEY * features..2 * KEY * features].to_vec(), features, KEY, Vec::new()),
+            value: dense(qkv[2 * KEY * features..].to_vec(), features, VALUE, Vec::new()),
+            hidden: dense(hidden, features + VALUE, HIDDEN, part(self.hidden_bias)),
             output: dense(part(self.output), HIDDEN, self.outputs(), part(self.output_bias)),
         }
     }

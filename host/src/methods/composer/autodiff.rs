@@ -6,7 +6,9 @@
 use burn::tensor::activation::softmax;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 
-use super::actor::{ActorLayout, EMBED, KEY, LEAKS, LOG_DENSITY_CONSTANT, MEMORY, VALUE, distance_bucket};
+use composer_shared::policy::distance_bucket;
+
+use super::actor::{ActorLayout, EMBED, KEY, LEAKS, LOG_DENSITY_CONSTANT, MEMORY, VALUE};
 use super::critic::CriticLayout;
 use super::fused::bias_tanh;
 use crate::environment::PRIVILEGED;

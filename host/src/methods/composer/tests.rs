@@ -1,8 +1,9 @@
 //! The networks of COMPOSER in rollouts and updates: gradients against slopes and against automatic differentiation, ratios, threads.
 
+use composer_shared::observation::{BASE, SIZE};
+use composer_shared::policy::{MEMORY, distance_bucket};
 use rand::RngExt;
 
-use super::actor::{MEMORY, distance_bucket};
 use super::float::FloatPolicy;
 use super::*;
 use crate::environment::{Drift, Environment, Lesson, PRIVILEGED, Told, Trivial, View};
@@ -573,7 +574,7 @@ fn the_imagination_points_at_the_target_and_the_control_policy_follows() {
             let normalised: Vec<f32> = view
                 .observations
                 .iter()
-                .flat_map(|o| (0..SIZE).map(|i| ((o[i] - network.mean[i]) / network.std[i]).clamp(-5.0, 5.0)))
+                .flat_map(|o| (0..BASE).map(|i| ((o[i] - network.mean[i]) / network.std[i]).clamp(-5.0, 5.0)))
                 .collect();
             let means =
                 imagination.means(&normalised, &view.heard, &[3], Remembered::default(), &mut scratch).as_chunks().0;
@@ -582,7 +583,13 @@ fn the_imagination_points_at_the_target_and_the_control_policy_follows() {
             let best = view.observations.iter().map(|o| o[0].hypot(o[1]).min(bound)).sum::<f32>() / 3.0;
             possible += best;
             let mut actions = [[0.0; 2]; 3];
-            FloatPolicy::new(&network).act(&view.observations, &view.heard, &mut actions, None);
+            FloatPolicy::new(&network).act(
+                &mut [[0.0; MEMORY]; 3],
+                &view.observations,
+                &view.heard,
+                &mut actions,
+                None,
+            );
             let outcome = env.step(&actions);
             if outcome.truncated {
                 distance += outcome.distance / 100.0;
@@ -600,7 +607,13 @@ fn the_imagination_points_at_the_target_and_the_control_policy_follows() {
         for _ in 0..Drift::STEPS {
             env.view(&mut view);
             let mut actions = [[0.0; 2]; 3];
-            FloatPolicy::new(&network).act(&view.observations, &view.heard, &mut actions, None);
+            FloatPolicy::new(&network).act(
+                &mut [[0.0; MEMORY]; 3],
+                &view.observations,
+                &view.heard,
+                &mut actions,
+                None,
+            );
             let outcome = env.step(&actions);
             apart += if outcome.truncated { outcome.distance / 100.0 } else { 0.0 };
         }

@@ -223,7 +223,7 @@ impl<N: DeterministicActorCritic> OffPolicy<N> {
             view.heard.iter().enumerate().map(|(module, heard)| heard | 1 << module).collect()
         };
         for worker in &self.environments {
-            new.observations.extend(worker.view.observations.iter().flatten());
+            new.observations.extend(raw(&worker.view));
             new.heard.extend(heard(&worker.view));
         }
         new.actions = if random {
@@ -244,7 +244,7 @@ impl<N: DeterministicActorCritic> OffPolicy<N> {
             worker.environment.view(&mut worker.view);
             new.rewards.push(outcome.reward);
             new.done.push(f32::from(u8::from(outcome.terminated)));
-            new.next_observations.extend(worker.view.observations.iter().flatten());
+            new.next_observations.extend(raw(&worker.view));
             new.next_heard.extend(heard(&worker.view));
             if outcome.terminated || outcome.truncated {
                 worker.episode += 1;
