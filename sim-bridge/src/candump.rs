@@ -50,8 +50,15 @@ pub enum CandumpError {
 
 /// Writes one line, with a time in ns (cut to microseconds).
 pub fn write_entry(out: &mut dyn Write, at_ns: u64, interface: &str, frame: &Frame) -> io::Result<()> {
-    const HEX: &[u8; 16] = b"0123456789ABCDEF";
     let us = at_ns / 1000;
+    write!(out, "({:010}.{:06}) {interface} ", us / 1_000_000, us % 1_000_000)?;
+    write_frame(out, frame)?;
+    out.write_all(b"\n")
+}
+
+/// Writes a frame as cansend takes it.
+pub fn write_frame(out: &mut dyn Write, frame: &Frame) -> io::Result<()> {
+    const HEX: &[u8; 16] = b"0123456789ABCDEF";
     let mut text = [0; 130];
     let mut len = 0;
     for &byte in frame.payload() {
@@ -59,12 +66,11 @@ pub fn write_entry(out: &mut dyn Write, at_ns: u64, interface: &str, frame: &Fra
         text[len + 1] = HEX[usize::from(byte & 15)];
         len += 2;
     }
-    write!(out, "({:010}.{:06}) {interface} {:03X}#", us / 1_000_000, us % 1_000_000, frame.id)?;
+    write!(out, "{:03X}#", frame.id)?;
     if frame.fd {
         out.write_all(if frame.brs { b"#1" } else { b"#0" })?;
     }
-    out.write_all(&text[..len])?;
-    out.write_all(b"\n")
+    out.write_all(&text[..len])
 }
 
 /// The interface that stands for a piece of cable, from the head end: `can0`, after a cut also `can1`.
@@ -126,6 +132,40 @@ pub fn parse_frame(text: &str) -> Result<Frame, CandumpError> {
     Ok(Frame { brs, ..frame })
 }
 
+/// A log that has been read.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Log {
+    /// Its lines, each with its number, from 1; empty ones are left out.
+    pub entries: Vec<(u64, Entry)>,
+    /// The number of its last line, if that has no end: whoever wrote it was cut off. It is left out, because of a frame half of it may look like another whole one.
+    pub cut: Option<u64>,
+}
+
+impl Log {
+    /// Reads a log that may have been cut off. The error names the line, from 1.
+    ///
+    /// # Errors
+    ///
+    /// If a line with an end cannot be read.
+    pub fn parse(log: &str) -> Result<Self, (u64, CandumpError)> {
+        let mut read = Log::default();
+        for (number, line) in (1..).zip(log.split_inclusive('\n')) {
+            match line.strip_suffix('\n') {
+                None => read.cut = Some(number),
+                Some(line) if line.trim().is_empty() => {}
+                Some(line) => read.entries.push((number, parse_entry(line).map_err(|error| (number, error))?)),
+            }
+        }
+        Ok(read)
+    }
+
+    /// The line of this number, from 1.
+    pub fn line(&self, number: u64) -> Option<&Entry> {
+        let index = self.entries.binary_search_by_key(&number, |(number, _)| *number).ok()?;
+        self.entries.get(index).map(|(_, entry)| entry)
+    }
+}
+
 /// Reads a whole log; empty lines are skipped. The error names the line, from 1.
 pub fn parse(log: &str) -> Result<Vec<Entry>, (usize, CandumpError)> {
     let lines = log.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
@@ -151,6 +191,20 @@ mod tests {
         let entries = parse(&text).unwrap();
         assert_eq!(entries.len(), 2);
         assert_eq!((entries[1].at_us, entries[1].frame.len, entries[1].interface.as_str()), (5, 12, "can1"));
+    }
+
+    #[test]
+    fn a_log_that_was_cut_off_is_read_up_to_there() {
+        let text = "(0.000001) can0 123#DEAD\n\n(0.000002) can0 124#DEADBEEF\n";
+        let log = Log::parse(text).unwrap();
+        assert_eq!((log.entries.len(), log.cut), (2, None));
+        assert_eq!((log.line(3).unwrap().frame.id, log.line(2)), (0x124, None));
+        // Two digits less would be another frame, three no frame at all.
+        for missing in [1, 3, 4, 20] {
+            let log = Log::parse(&text[..text.len() - missing]).unwrap();
+            assert_eq!((log.entries.len(), log.cut), (1, Some(3)), "{missing}");
+        }
+        assert_eq!(Log::parse("nonsense\n").unwrap_err().0, 1);
     }
 
     #[test]

@@ -2,7 +2,7 @@
 //! A simulated CAN bus in virtual time with the modules of a snake robot as its nodes.
 //!
 //! [`bus`] is the bus, with [`frame_bits`] for the length of frames, [`confinement`] for its error counters and [`faults`] for what goes wrong; [`candump`] writes and
-//! reads its logs. [`sil`] puts complete firmware controllers and the ground station ([`station`]) on it and lets them control
+//! reads its logs, [`pcap`] writes them for Wireshark, and [`capture`] beside them what [`replay`] needs to run one module again. [`sil`] puts complete firmware controllers and the ground station ([`station`]) on it and lets them control
 //! anything that implements [`Plant`]. A module's controller runs in this process or elsewhere ([`computer`], [`remote`]), above all in an
 //! emulated microcontroller ([`qemu`]), and the plant may be in another process too ([`external_plant`]). [`sensor_model`] makes of the true state
 //! of a module what its chips read. Nothing of these depends on wall-clock time: the same seed gives the same run, bit for bit. [`live`] is the
@@ -35,6 +35,7 @@
 
 pub mod bus;
 pub mod candump;
+pub mod capture;
 pub mod computer;
 pub mod confinement;
 pub mod external_plant;
@@ -42,10 +43,12 @@ pub mod faults;
 pub mod frame_bits;
 #[cfg(unix)]
 pub mod live;
+pub mod pcap;
 pub mod plant;
 pub mod port;
 pub mod qemu;
 pub mod remote;
+pub mod replay;
 pub mod sensor_model;
 pub mod sil;
 pub mod slcan;
