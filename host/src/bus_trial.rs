@@ -1,6 +1,6 @@
 //! Sets of episodes with complete controllers, each with the frozen policy, on a simulated CAN bus.
 
-use std::io::Write;
+use std::io;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -8,12 +8,14 @@ use anyhow::{Result, bail};
 use composer_firmware::controller::BusKind;
 use composer_shared::policy::Policy;
 use composer_shared::robot::AXES;
+use composer_shared::wire::Frame;
+use composer_sim_bridge::capture::Capture;
 use composer_sim_bridge::computer::{InProcess, Launcher};
 use composer_sim_bridge::external_plant::Address;
 use composer_sim_bridge::faults::{FaultKind, FaultPlan, PlannedFault};
 use composer_sim_bridge::frame_bits::BitRates;
 use composer_sim_bridge::qemu::Qemu;
-use composer_sim_bridge::sil::{self, CycleView, Outside, SilConfig, SilReport};
+use composer_sim_bridge::sil::{self, CycleView, Outside, SilConfig, SilReport, Watch};
 use serde::Serialize;
 
 use crate::env::EnvConfig;
@@ -138,6 +140,40 @@ pub struct BusTrial<'a> {
     pub elsewhere: Option<Elsewhere>,
 }
 
+/// What is written down while episodes run.
+#[derive(Default)]
+pub struct Written<'w> {
+    /// How many of the first episodes.
+    pub episodes: usize,
+    /// The frames on the bus, and what the modules were told and answered.
+    pub capture: Option<Capture<'w>>,
+}
+
+/// Everybody who looks at an episode.
+struct Watching<'a, 'w> {
+    written: Option<&'a Written<'w>>,
+    recorder: &'a mut Option<Recorder>,
+}
+
+impl Watch<SnakePlant> for Watching<'_, '_> {
+    fn frame(&mut self, at_ns: u64, piece: usize, frame: &Frame) -> io::Result<()> {
+        match self.written.and_then(|written| written.capture.as_ref()) {
+            Some(mut capture) => Watch::<SnakePlant>::frame(&mut capture, at_ns, piece, frame),
+            None => Ok(()),
+        }
+    }
+
+    fn cycle(&mut self, view: &CycleView<'_>, plant: &SnakePlant) -> io::Result<()> {
+        if let Some(recorder) = self.recorder {
+            recorder.cycle(view, plant);
+        }
+        match self.written.and_then(|written| written.capture.as_ref()) {
+            Some(mut capture) => capture.cycle(view, plant),
+            None => Ok(()),
+        }
+    }
+}
+
 /// One episode on the bus, and how long it took.
 struct Run {
     episode: Episode,
@@ -172,7 +208,7 @@ impl BusTrial<'_> {
         sil
     }
 
-    fn episode(&self, index: usize, capture: Option<&mut dyn Write>) -> Result<Run> {
+    fn episode(&self, index: usize, written: Option<&Written<'_>>) -> Result<Run> {
         let seed = episode_seed(self.seed, index as u64);
         let sil = self.sil_config(seed);
         let policy = Policy::parse(self.image).map_err(|e| anyhow::anyhow!("{e}"))?;
@@ -182,9 +218,9 @@ impl BusTrial<'_> {
         let start = Instant::now();
         let ours = match self.qemu {
             Some(qemu) => {
-                self.simulate(qemu, policy, &sil, capture, (index < self.record).then_some(&name), &mut recorder)
+                self.simulate(qemu, policy, &sil, written, (index < self.record).then_some(&name), &mut recorder)
             }
-            None => self.simulate(&local, policy, &sil, capture, (index < self.record).then_some(&name), &mut recorder),
+            None => self.simulate(&local, policy, &sil, written, (index < self.record).then_some(&name), &mut recorder),
         }
         .map_err(|error| match self.qemu.is_some() || self.elsewhere.is_some() {
             true => error.context(name.clone()),
@@ -215,7 +251,7 @@ impl BusTrial<'_> {
         launcher: &L,
         policy: Policy<'_>,
         sil: &SilConfig,
-        capture: Option<&mut dyn Write>,
+        written: Option<&Written<'_>>,
         recorded: Option<&String>,
         recorder: &mut Option<Recorder>,
     ) -> Result<Outcome> {
@@ -227,15 +263,30 @@ impl BusTrial<'_> {
             plant.keep_trace();
         }
         *recorder = recorded.map(|name| Recorder::new(name, &plant, &sil.faults));
-        let report = sil::run_on(launcher, &mut plant, policy, sil, capture, &mut |cycle, plant| {
-            if let Some(recorder) = recorder {
-                recorder.cycle(cycle, plant);
-            }
-        })?;
+        let report = self.watched(launcher, &mut plant, policy, sil, None, Watching { written, recorder })?;
         if let Some(trouble) = plant.trouble() {
             bail!("at {:.3} s {trouble}", report.duration_ns as f64 * 1e-9);
         }
         Ok(Outcome { plant, report })
+    }
+
+    /// Runs an episode while somebody looks.
+    fn watched<L: Launcher>(
+        &self,
+        launcher: &L,
+        plant: &mut SnakePlant,
+        policy: Policy<'_>,
+        sil: &SilConfig,
+        outside: Option<&mut dyn Outside>,
+        mut watching: Watching<'_, '_>,
+    ) -> Result<SilReport, sil::SilError> {
+        match watching.written.and_then(|written| written.capture.as_ref()) {
+            None => sil::run_watched(launcher, plant, policy, sil, outside, &mut watching),
+            Some(capture) => {
+                capture.begin_run();
+                sil::run_watched(&capture.recording(launcher), plant, policy, sil, outside, &mut watching)
+            }
+        }
     }
 
     fn check(&self) -> Result<()> {
@@ -255,7 +306,7 @@ impl BusTrial<'_> {
         outside: &mut dyn Outside,
         station: bool,
         limit_ns: u64,
-        capture: Option<&mut dyn Write>,
+        written: &Written<'_>,
     ) -> Result<SilReport> {
         self.check()?;
         let seed = episode_seed(self.seed, 0);
@@ -266,10 +317,10 @@ impl BusTrial<'_> {
             None => SnakePlant::new(self.config.clone(), seed),
         };
         plant.make_endless();
-        let (outside, observer) = (Some(outside), &mut |_: &CycleView<'_>, _: &SnakePlant| {});
+        let (outside, watching) = (Some(outside), Watching { written: Some(written), recorder: &mut None });
         let report = match self.qemu {
-            Some(qemu) => sil::run_with(qemu, &mut plant, policy, &sil, outside, capture, observer),
-            None => sil::run_with(&InProcess::new(policy), &mut plant, policy, &sil, outside, capture, observer),
+            Some(qemu) => self.watched(qemu, &mut plant, policy, &sil, outside, watching),
+            None => self.watched(&InProcess::new(policy), &mut plant, policy, &sil, outside, watching),
         }?;
         match plant.trouble() {
             Some(trouble) => bail!("at {:.3} s {trouble}", report.duration_ns as f64 * 1e-9),
@@ -277,17 +328,17 @@ impl BusTrial<'_> {
         }
     }
 
-    /// Runs all episodes. `progress` is called after each.
+    /// Runs all episodes, those that are written down first, one after the other. `progress` is called after each.
     pub fn run(
         &self,
-        capture: Option<&mut dyn Write>,
+        written: &Written<'_>,
         progress: &(dyn Fn() + Sync),
     ) -> Result<(BusReport, Vec<crate::replay::Episode>)> {
         self.check()?;
         let mut runs = Vec::with_capacity(self.episodes);
-        let alone = usize::from(capture.is_some());
-        if capture.is_some() {
-            runs.push(self.episode(0, capture)?);
+        let alone = written.episodes.min(self.episodes);
+        for index in 0..alone {
+            runs.push(self.episode(index, Some(written))?);
             progress();
         }
         // A server serves one after the other; the second would wait for its greeting.

@@ -118,6 +118,10 @@ impl Plant for SnakePlant {
         (0..self.config.finer_by).for_each(|_| self.physics_step());
     }
 
+    fn move_goal(&mut self, [x, y, _]: Point) -> bool {
+        self.judge.move_goal(&self.config.task, [x, y])
+    }
+
     fn done(&self) -> bool {
         let over = self.judge.verdict().success || self.judge.steps() >= self.config.cap();
         over && !self.endless || self.trouble().is_some()

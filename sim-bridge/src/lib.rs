@@ -6,7 +6,7 @@
 //! anything that implements [`Plant`]. A module's controller runs in this process or elsewhere ([`computer`], [`remote`]), above all in an
 //! emulated microcontroller ([`qemu`]), and the plant may be in another process too ([`external_plant`]). [`sensor_model`] makes of the true state
 //! of a module what its chips read. Nothing of these depends on wall-clock time: the same seed gives the same run, bit for bit. [`live`] is the
-//! exception: it lets a run keep pace with the clock on the wall and offers its bus on a pseudo-terminal, in the text protocol [`slcan`].
+//! exception: it lets a run keep pace with the clock on the wall and offers its bus on a pseudo-terminal, in the text protocol [`slcan`], and take [commands](control) that break and mend the robot.
 //!
 //! A robot on the bench, whose module 3 loses its power while it runs:
 //!
@@ -38,6 +38,7 @@ pub mod candump;
 pub mod capture;
 pub mod computer;
 pub mod confinement;
+pub mod control;
 pub mod external_plant;
 pub mod faults;
 pub mod frame_bits;

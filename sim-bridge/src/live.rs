@@ -3,7 +3,8 @@
 //!
 //! A [`Terminal`] looks to other programs like the serial port of an [slcan](crate::slcan) adapter. What they write enters the simulated bus as the
 //! frames of one more node: with arbitration, acknowledgement, error counters. What the other nodes say comes out; what came in at a terminal does
-//! not come out of it again. While nobody has a terminal open, or its channel is closed, nothing is kept for it.
+//! not come out of it again. While nobody has a terminal open, or its channel is closed, nothing is kept for it. A [`Control`]
+//! lets programs break and mend the robot while it runs.
 
 use std::collections::VecDeque;
 use std::ffi::OsStr;
@@ -21,7 +22,8 @@ use rustix::io::Errno;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{OptionalActions, QueueSelector, tcflush, tcgetattr, tcsetattr};
 
-use crate::sil::{Outside, Turn};
+use crate::control::Control;
+use crate::sil::{Outside, Refusal, Turn};
 use crate::slcan::{Adapter, Lines, Obeyed, REFUSED, Received, write_frame};
 
 /// Most bytes kept for a program that does not read; then whole frames are lost, as in an adapter.
@@ -199,13 +201,20 @@ pub struct Live<'a> {
     /// When the simulation was at 0, or would have been if it had not fallen behind since.
     start: Option<Instant>,
     behind: Duration,
+    /// Programs that command the run.
+    control: Option<Control>,
     ended: &'a AtomicBool,
 }
 
 impl<'a> Live<'a> {
     /// A run with these terminals at `pace` times real time that ends when `ended` is set.
     pub fn new(terminals: Vec<Terminal>, pace: f64, ended: &'a AtomicBool) -> Self {
-        Live { terminals, coming: VecDeque::new(), pace, start: None, behind: Duration::ZERO, ended }
+        Live { terminals, coming: VecDeque::new(), pace, start: None, behind: Duration::ZERO, control: None, ended }
+    }
+
+    /// The same with programs that command it.
+    pub fn commanded(self, control: Option<Control>) -> Self {
+        Live { control, ..self }
     }
 
     /// The terminals.
@@ -232,6 +241,10 @@ impl<'a> Live<'a> {
                 PollFd::new(&terminal.master, PollFlags::IN | write)
             })
             .collect();
+        for (source, write) in self.control.iter().flat_map(Control::sources) {
+            let write = if write { PollFlags::OUT } else { PollFlags::empty() };
+            fds.push(PollFd::from_borrowed_fd(source, PollFlags::IN | write));
+        }
         let time = Timespec { tv_sec: 0, tv_nsec: i64::from(longest.subsec_nanos()) as _ };
         let _ = poll(&mut fds, Some(&time));
     }
@@ -255,6 +268,9 @@ impl Outside for Live<'_> {
                 terminal.write();
                 self.coming.extend(frames.into_iter().map(|frame| (number, frame)));
             }
+            if let Some(change) = self.control.as_mut().and_then(Control::asked) {
+                return Turn::Change(change);
+            }
             let passed = start.elapsed();
             if let Some((node, frame)) = self.coming.pop_front() {
                 let at_ns = (passed.as_secs_f64() * self.pace * 1e9) as u64;
@@ -272,6 +288,12 @@ impl Outside for Live<'_> {
                 self.behind += late;
             }
             return Turn::GoOn;
+        }
+    }
+
+    fn changed(&mut self, now: u64, outcome: Result<(), Refusal>) {
+        if let Some(control) = &mut self.control {
+            control.changed(now, outcome);
         }
     }
 

@@ -4,7 +4,7 @@
 
 mod common;
 
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -257,4 +257,53 @@ fn emulated_microcontrollers_answer_as_modules_in_this_process_do() {
     );
     assert_eq!(live.bus(&["stop"]).trim(), "stopped: modules 0 to 2");
     assert!(live.interrupt().contains("s simulated"));
+}
+
+#[test]
+fn a_script_unplugs_module_3_while_the_robot_runs_and_the_others_go_on() {
+    let live = Live::start(&["--control", "127.0.0.1:0"]);
+    let address = live.control();
+    std::fs::write(live.path().join("robot.dbc"), succeed(live.path(), &["dbc"])).unwrap();
+    let output = python(live.path(), "control.py", &["bus", "robot.dbc", "8", &address]);
+    let complaint = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{complaint}");
+    let seen: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert!(seen["unplugged_for"].as_f64().unwrap() > 0.3 && seen["help"].as_str().unwrap().starts_with("unplug M, "));
+    for (command, sentence) in [
+        ("explode", "there is no command `explode`: there are unplug M, "),
+        ("unplug", "there is no module 8: this robot has 8, numbered from 0"),
+        ("cut", "there is no cable behind module 7: it is the last one"),
+        ("plug", "not so: module 3 is plugged in"),
+        ("drop", "2 is no probability: it lies between 0 and 1"),
+        ("goal", "`goal here` is not how it is written: goal X Y, such as goal 12 -3.5"),
+        ("long", "a command has at most 200 bytes"),
+    ] {
+        let answer = seen["refused"][command].as_str().unwrap();
+        assert!(answer.starts_with(&format!("refused: {sentence}")), "{answer}");
+    }
+    assert!(live.interrupt().contains("s simulated"));
+}
+
+#[test]
+fn what_this_plant_or_bus_cannot_do_is_refused() {
+    let live = Live::start(&["--control", "127.0.0.1:0", "--no-station"]);
+    let mut control = std::net::TcpStream::connect(live.control()).unwrap();
+    let mut answers = BufReader::new(control.try_clone().unwrap()).lines();
+    let mut ask = |line: &str| {
+        control.write_all(format!("{line}\n").as_bytes()).unwrap();
+        answers.next().unwrap().unwrap()
+    };
+    assert!(ask("stop").starts_with("refused: there is no station in this run"));
+    assert!(ask("goal 3 4").starts_with("ok at "));
+    let folder = live.path();
+    let start = ["sil", "wall-climbing", "--live", "slcan:wall", "--control"];
+    refuse(folder, &[&start[..], &["192.0.2.1:7000"]].concat(), &["192.0.2.1:7000 is not on this machine"]);
+    refuse(folder, &["sil", "goal-reaching", "--control", "127.0.0.1:0"], &["--live"]);
+    let taken = live.control();
+    refuse(folder, &[&start[..], &[&taken]].concat(), &["nobody can connect to", &taken]);
+    let wall = Live::start_with("wall-climbing", &["--control", "127.0.0.1:0"]);
+    let mut control = std::net::TcpStream::connect(wall.control()).unwrap();
+    control.write_all(b"goal 3 4\n").unwrap();
+    let answer = BufReader::new(control).lines().next().unwrap().unwrap();
+    assert!(answer.starts_with("refused: this plant has no goal that can be moved"), "{answer}");
 }

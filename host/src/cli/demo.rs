@@ -11,7 +11,7 @@ use composer_sim_bridge::faults::FaultPlan;
 
 use super::common::{REPLAYED, episode_bar, write_replay};
 use super::{PolicySource, task_by_name};
-use crate::bus_trial::{BusReport, BusSettings, BusTrial};
+use crate::bus_trial::{BusReport, BusSettings, BusTrial, Written};
 use crate::env::EnvConfig;
 use crate::eval::DEFAULT_SEED;
 use crate::replay::Episode;
@@ -84,7 +84,7 @@ impl Shipped {
             elsewhere: None,
         };
         let bar = episode_bar(self.name, arguments.episodes);
-        let result = trial.run(None, &|| bar.inc(1));
+        let result = trial.run(&Written::default(), &|| bar.inc(1));
         bar.finish_and_clear();
         result
     }

@@ -12,6 +12,7 @@ mod flash;
 mod mjcf;
 mod physics;
 mod policy_file;
+mod replay;
 mod report;
 mod sil;
 mod test;
@@ -48,6 +49,8 @@ enum Verb {
     Export(export::Arguments),
     /// Run complete controllers with a frozen policy on a simulated CAN bus.
     Sil(sil::Arguments),
+    /// Run one module of a capture again, and say whether it does the same, torque by torque and frame by frame.
+    Replay(replay::Arguments),
     /// Run scenarios on the simulated bus: faults, and what is expected of the robot, as data.
     Test(test::Arguments),
     /// Search for a schedule of faults that breaks a rule, and shrink it.
@@ -92,6 +95,7 @@ pub fn main() -> ExitCode {
         Some(Verb::Eval(arguments)) => eval::run(&arguments),
         Some(Verb::Export(arguments)) => export::run(&arguments),
         Some(Verb::Sil(arguments)) => sil::run(&arguments),
+        Some(Verb::Replay(arguments)) => replay::run(&arguments),
         Some(Verb::Test(arguments)) => test::run(&arguments),
         Some(Verb::Campaign(arguments)) => campaign::run(&arguments),
         Some(Verb::Report(arguments)) => report::run(&arguments),

@@ -1,22 +1,25 @@
 //! `snakectl sil`: complete controllers, each with the frozen policy, on a simulated CAN bus.
 
-use std::io::Write;
-use std::path::PathBuf;
+use std::fs::File;
+use std::io::BufWriter;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
 use composer_firmware::controller::{BusKind, Timing};
 use composer_shared::policy::Policy;
+use composer_sim_bridge::capture::{Capture, Format, Heading};
 use composer_sim_bridge::external_plant::{self, Address};
 use composer_sim_bridge::qemu::{self, Qemu};
+use composer_sim_bridge::sil::SilError;
 
 use super::PolicySource;
 use super::common::{Common, REPLAYED, table, write_replay};
-use crate::bus_trial::{BusReport, BusSettings, BusTrial};
+use crate::bus_trial::{BusReport, BusSettings, BusTrial, Written};
 use crate::env::EnvConfig;
 use crate::external::Elsewhere;
-use crate::files::write_whole;
 
 /// Kind of bus, on the command line.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
@@ -68,9 +71,6 @@ pub struct Emulation {
     /// Seconds after which an emulated module that does not answer is given up
     #[arg(long, value_name = "S", requires = "qemu", default_value_t = qemu::PATIENCE.as_secs_f64())]
     pub qemu_timeout: f64,
-    /// Run every episode in this process too, and compare all torques bit for bit
-    #[arg(long, requires = "qemu")]
-    pub parity: bool,
 }
 
 impl Emulation {
@@ -133,6 +133,9 @@ pub struct LiveOptions {
     /// No station on the bus: whoever opens the terminal is the station
     #[arg(long, requires = "live")]
     no_station: bool,
+    /// Let programs break and mend the robot while it runs: 127.0.0.1:PORT, one line a command, such as `unplug 3`; `help` says what there is
+    #[arg(long, value_name = "ADDRESS", requires = "live")]
+    control: Option<SocketAddr>,
     /// End after so many seconds of the simulation
     #[arg(long, value_name = "S", requires = "live")]
     seconds: Option<f64>,
@@ -145,6 +148,73 @@ fn live_path(text: &str) -> Result<PathBuf, String> {
     }
 }
 
+/// What is written down.
+#[derive(clap::Args, Clone, Debug)]
+pub struct Files {
+    /// Write the frames of the first episode as a candump log, or, if its name ends in .pcap, for Wireshark
+    #[arg(long, value_name = "FILE")]
+    capture: Option<PathBuf>,
+    /// So many of the first episodes
+    #[arg(long, value_name = "N", requires = "capture", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    capture_episodes: u32,
+    /// Write beside it, as FILE.modules, what every module was told and answered, so that `snakectl replay` can run one of them again
+    #[arg(long, requires = "capture")]
+    replayable: bool,
+}
+
+/// The files, open.
+struct Opened {
+    log: Option<(PathBuf, BufWriter<File>)>,
+    transcript: Option<(PathBuf, BufWriter<File>)>,
+}
+
+impl Files {
+    fn open(&self) -> Result<Opened> {
+        let pcap = |path: &&PathBuf| path.extension().is_some_and(|extension| extension == "pcap");
+        if self.replayable && self.capture.as_ref().is_some_and(|path| pcap(&path)) {
+            bail!("--replayable goes with a candump log: `snakectl replay` does not read pcap files");
+        }
+        let create = |path: PathBuf| match File::create(&path) {
+            Ok(file) => Ok((path, BufWriter::new(file))),
+            Err(error) => Err(error).with_context(|| format!("cannot write {}", path.display())),
+        };
+        let log = self.capture.clone().map(create).transpose()?;
+        let transcript = self.capture.as_deref().filter(|_| self.replayable).map(transcript_of);
+        Ok(Opened { log, transcript: transcript.map(create).transpose()? })
+    }
+}
+
+/// Where the transcript of a log lies.
+pub fn transcript_of(log: &Path) -> PathBuf {
+    let mut name = log.as_os_str().to_owned();
+    name.push(".modules");
+    name.into()
+}
+
+impl Opened {
+    /// What is to be written down in these files, of runs with this policy.
+    fn written(&mut self, policy: &str, trial: &BusTrial<'_>, episodes: usize) -> Result<Written<'_>> {
+        let Some((path, log)) = &mut self.log else { return Ok(Written::default()) };
+        let pcap = path.extension().is_some_and(|extension| extension == "pcap");
+        let mut capture = Capture::new(log, if pcap { Format::Pcap } else { Format::Candump })?;
+        if let Some((_, transcript)) = &mut self.transcript {
+            let image = Policy::parse(trial.image).map_err(|e| anyhow::anyhow!("{e}"))?;
+            let heading = Heading::new(policy, &image, trial.config.robot.modules);
+            capture = capture.with_transcript(transcript, &heading);
+        }
+        Ok(Written { episodes, capture: Some(capture) })
+    }
+
+    fn paths(&self) -> impl Iterator<Item = &PathBuf> {
+        self.log.iter().chain(&self.transcript).map(|(path, _)| path)
+    }
+}
+
+/// What has been written is whole.
+fn finish(written: Written<'_>) -> Result<()> {
+    Ok(written.capture.map_or(Ok(()), Capture::finish).map_err(SilError::Capture)?)
+}
+
 /// Arguments of `sil`.
 #[derive(clap::Args, Clone, Debug)]
 pub struct Arguments {
@@ -154,13 +224,15 @@ pub struct Arguments {
     bus: BusOptions,
     #[command(flatten)]
     emulation: Emulation,
+    /// Run every episode in this process too, and compare all torques bit for bit
+    #[arg(long, requires = "qemu")]
+    parity: bool,
     #[command(flatten)]
     plant: PlantOptions,
     #[command(flatten)]
     live: LiveOptions,
-    /// Write the frames of the first episode as a candump log
-    #[arg(long, value_name = "FILE")]
-    capture: Option<PathBuf>,
+    #[command(flatten)]
+    files: Files,
     /// Write the first episodes as one HTML page to look at
     #[arg(long, value_name = "FILE")]
     replay: Option<PathBuf>,
@@ -191,21 +263,19 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         threads: common.threads.unwrap_or_else(super::cores),
         record,
         qemu: qemu.as_ref(),
-        parity: arguments.emulation.parity,
+        parity: arguments.parity,
         elsewhere: arguments.plant.elsewhere()?,
     };
-    let mut captured = Vec::new();
-    let capture: Option<&mut dyn Write> = if arguments.capture.is_some() { Some(&mut captured) } else { None };
+    let mut files = arguments.files.open()?;
+    let written = files.written(&common.policy, &trial, arguments.files.capture_episodes as usize)?;
     if !arguments.live.live.is_empty() {
-        run_live(&trial, &arguments.live, capture)?;
-        return arguments.capture.iter().try_for_each(|path| write_whole(path, &captured));
+        run_live(&trial, &arguments.live, &written)?;
+        return finish(written);
     }
     let bar = common.bar();
-    let (report, recorded) = trial.run(capture, &|| bar.inc(1))?;
+    let (report, recorded) = trial.run(&written, &|| bar.inc(1))?;
     bar.finish_and_clear();
-    if let Some(path) = &arguments.capture {
-        write_whole(path, &captured)?;
-    }
+    finish(written)?;
     if let Some(path) = &arguments.replay {
         let title = format!("{} on the simulated bus", config.task.task().title());
         write_replay(&config, &title, recorded, &common.policy, path)?;
@@ -214,7 +284,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         println!("{}", serde_json::to_string(&report)?);
     } else {
         print!("{}{}", table(&report.task), bus_table(&report));
-        for path in arguments.capture.iter().chain(&arguments.replay) {
+        for path in files.paths().chain(&arguments.replay) {
             println!("  written: {}", path.display());
         }
     }
@@ -226,7 +296,8 @@ pub fn run(arguments: &Arguments) -> Result<()> {
 
 /// Offers the bus in real time until Ctrl-C.
 #[cfg(unix)]
-fn run_live(trial: &BusTrial<'_>, options: &LiveOptions, capture: Option<&mut dyn Write>) -> Result<()> {
+fn run_live(trial: &BusTrial<'_>, options: &LiveOptions, written: &Written<'_>) -> Result<()> {
+    use composer_sim_bridge::control::Control;
     use composer_sim_bridge::live::{Live, Terminal};
     if !(0.001..=1000.0).contains(&options.pace) {
         bail!("--pace is 0.001 to 1000 times real time");
@@ -235,14 +306,18 @@ fn run_live(trial: &BusTrial<'_>, options: &LiveOptions, capture: Option<&mut dy
         bail!("--seconds is 0.001 to 1000000000");
     }
     let ended = super::interrupted()?;
+    let control = options.control.map(Control::listen).transpose()?;
     let open = |path: &PathBuf| Terminal::open(path, trial.bus.kind == BusKind::Fd);
     let terminals = options.live.iter().map(open).collect::<Result<Vec<_>, _>>()?;
     for path in &options.live {
         eprintln!("{} modules on the bus slcan:{}; Ctrl-C ends it", trial.config.robot.modules, path.display());
     }
-    let mut live = Live::new(terminals, options.pace, &ended);
+    if let Some(control) = &control {
+        eprintln!("commands are taken at {}", control.address());
+    }
+    let mut live = Live::new(terminals, options.pace, &ended).commanded(control);
     let limit_ns = options.seconds.map_or(u64::MAX, |seconds| (seconds * 1e9) as u64);
-    let report = trial.live(&mut live, !options.no_station, limit_ns, capture)?;
+    let report = trial.live(&mut live, !options.no_station, limit_ns, written)?;
     for lost in &report.lost {
         eprintln!("note: module {} was lost at {:.3} s: {}", lost.module, lost.at_ns as f64 * 1e-9, lost.how);
     }
@@ -260,7 +335,7 @@ fn run_live(trial: &BusTrial<'_>, options: &LiveOptions, capture: Option<&mut dy
 }
 
 #[cfg(not(unix))]
-fn run_live(_: &BusTrial<'_>, _: &LiveOptions, _: Option<&mut dyn Write>) -> Result<()> {
+fn run_live(_: &BusTrial<'_>, _: &LiveOptions, _: &Written<'_>) -> Result<()> {
     bail!("--live needs pseudo-terminals, which Linux and macOS have");
 }
 

@@ -340,6 +340,15 @@ impl Judge {
         self.low_steps
     }
 
+    /// Moves the goal of a task that has a place to go to, on the ground; false for a task whose goal is part of its scene.
+    pub fn move_goal(&mut self, task: &TaskConfig, [x, y]: [f32; 2]) -> bool {
+        let movable = matches!(task.task(), Task::GoalReaching | Task::BlockPushing);
+        if movable {
+            self.course.goal = [x, y, self.course.goal[2]];
+        }
+        movable
+    }
+
     /// Point `number` of the scene in the frame of the head link, as the station tells it.
     pub fn point_from_head(&self, task: &TaskConfig, snake: &Snake, number: u8) -> Option<Point> {
         task.rules().point(&self.course, snake, number).map(|point| snake.in_head_frame(point))

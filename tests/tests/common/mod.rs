@@ -2,6 +2,7 @@
 
 #![allow(dead_code)] // Each test file uses a part.
 
+use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -64,28 +65,49 @@ pub fn arm_image(address: u32) -> Vec<u8> {
 pub struct Live {
     folder: tempfile::TempDir,
     process: Child,
+    /// What it says on standard error, line by line.
+    said: std::sync::mpsc::Receiver<String>,
+    control: std::cell::OnceCell<String>,
 }
 
 impl Live {
     /// `snakectl sil goal-reaching --live ...` with anything else that `more` asks for.
     pub fn start(more: &[&str]) -> Self {
+        Live::start_with("goal-reaching", more)
+    }
+
+    /// The same with another policy.
+    pub fn start_with(policy: &str, more: &[&str]) -> Self {
         let folder = tempfile::tempdir().unwrap();
-        let start = ["sil", "goal-reaching", "--live", "slcan:bus", "--live", "slcan:bus2", "--seed", "5"];
+        let start = ["sil", policy, "--live", "slcan:bus", "--live", "slcan:bus2", "--seed", "5"];
         let mut process = command(folder.path(), &[&start, more].concat())
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
             .spawn()
             .unwrap();
+        let (tell, said) = std::sync::mpsc::channel();
+        let complaints = BufReader::new(process.stderr.take().unwrap());
+        std::thread::spawn(move || complaints.lines().map_while(Result::ok).try_for_each(|line| tell.send(line)));
         let patience = Instant::now();
         while !folder.path().join("bus2").exists() {
             if let Some(status) = process.try_wait().unwrap() {
-                let complaints = std::io::read_to_string(process.stderr.take().unwrap()).unwrap();
-                panic!("it ended: {status}, {complaints}");
+                panic!("it ended: {status}, {}", said.iter().collect::<Vec<_>>().join("\n"));
             }
             assert!(patience.elapsed() < Duration::from_secs(60));
             std::thread::sleep(Duration::from_millis(5));
         }
-        Live { folder, process }
+        Live { folder, process, said, control: std::cell::OnceCell::new() }
+    }
+
+    /// Where it takes commands.
+    pub fn control(&self) -> String {
+        let wait = || loop {
+            let line = self.said.recv_timeout(Duration::from_secs(60)).expect("it says where it takes commands");
+            if let Some(address) = line.strip_prefix("commands are taken at ") {
+                return address.to_string();
+            }
+        };
+        self.control.get_or_init(wait).clone()
     }
 
     /// Its folder.
