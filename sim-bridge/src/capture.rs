@@ -17,6 +17,7 @@
 //! | `{"run":0,"from_us":0}` | a run begins; its times are so much later in the log |
 //! | `{"computer":3,"node":3,"start":"0001..."}` | the computer of a node is switched on: the [`Start`](composer_firmware::link::ToModule::Start) of the [link](composer_firmware::link), in hexadecimal. A node that is plugged in again gets another computer |
 //! | `{"computer":3,"now":150200,"bus":0,"room":3,"line":17,...}` | it is polled, and answers |
+//! | `{"computer":3,"interrupt":"000#...","off":true}` | something interrupts it between two polls: a frame, or, if that is null, its stop input; whether its motors coast from then on, and what it `tells` at once, if anything |
 //!
 //! A poll has `now`, the computer's clock in us; `bus`, 0 if its CAN controller is error active, 1 passive, 2 bus-off; `room`, frames that fit in its CAN port; `line`, the line of the log
 //! that it receives (from 1), or `told`, a frame that is not in the log, in candump's form; `sensors`, if they read something else than in its last poll: joint
@@ -30,6 +31,7 @@ use std::io::{self, Write};
 
 use composer_firmware::controller::{Boot, BusStatus, Config, Micros};
 use composer_firmware::link::{self, MESSAGE_MAX, ToModule};
+use composer_firmware::torque_off::Interrupt;
 use composer_shared::observation::Sensors;
 use composer_shared::policy::Policy;
 use composer_shared::robot::AXES;
@@ -107,12 +109,25 @@ pub(crate) struct Polled {
     pub sent: Vec<(usize, Option<String>)>,
 }
 
+/// Something interrupts a computer.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Interrupted {
+    pub computer: u64,
+    #[serde(deserialize_with = "Option::deserialize")]
+    pub interrupt: Option<String>,
+    pub off: bool,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tells: Option<String>,
+}
+
 /// A line of a transcript, but for the first.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(untagged)]
 pub(crate) enum Record {
     Begun(Begun),
     Started(Started),
+    Interrupted(Interrupted),
     Polled(Polled),
 }
 
@@ -395,6 +410,18 @@ impl<C: Computer> Computer for Recorded<'_, '_, C> {
             polled.sent.push((room, frame.as_ref().map(frame_text)));
         }
         Ok(frame)
+    }
+
+    fn interrupt(&mut self, interrupt: Interrupt<'_>) -> Result<(bool, Option<Frame>), Trouble> {
+        self.flush();
+        let (off, tells) = self.computer.interrupt(interrupt)?;
+        let interrupt = match interrupt {
+            Interrupt::Frame(frame) => Some(frame_text(frame)),
+            Interrupt::StopInput => None,
+        };
+        let record = Interrupted { computer: self.number, interrupt, off, tells: tells.as_ref().map(frame_text) };
+        self.capture.inner.borrow_mut().note(&record);
+        Ok((off, tells))
     }
 
     fn ask_status(&mut self) -> Result<(), Trouble> {

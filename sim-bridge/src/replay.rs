@@ -6,6 +6,7 @@ use std::fmt;
 use std::io::{self, BufRead};
 
 use composer_firmware::link::{self, Receiver, ToModule};
+use composer_firmware::torque_off::Interrupt;
 use composer_shared::observation::Sensors;
 use composer_shared::robot::AXES;
 
@@ -59,6 +60,8 @@ pub struct Verdict {
     pub starts: u64,
     /// Times that it was polled.
     pub polls: u64,
+    /// Times that something interrupted it.
+    pub interrupts: u64,
     /// Torques that were compared, yaw and pitch after each poll.
     pub torques: u64,
     /// Those of them whose bits differ.
@@ -183,6 +186,25 @@ pub fn replay<L: Launcher>(
                 let computer = launcher.start(config, boot, now).map_err(ReplayError::Computer)?;
                 computers.insert(started.computer, Again { computer, sensors: Sensors::ZERO, torque: [0.0; AXES] });
                 verdict.starts += 1;
+            }
+            Record::Interrupted(then) => {
+                let Some(again) = computers.get_mut(&then.computer) else { continue };
+                let frame = then.interrupt.as_deref().map(parse_frame).transpose();
+                let frame = frame.map_err(|error| nonsense(&error.to_string()))?;
+                let interrupt = frame.as_ref().map_or(Interrupt::StopInput, Interrupt::Frame);
+                let (off, tells) = again.computer.interrupt(interrupt).map_err(ReplayError::Computer)?;
+                let tells = tells.as_ref().map(frame_text);
+                sent.extend(tells.clone());
+                verdict.interrupts += 1;
+                if (off, &tells) != (then.off, &then.tells) {
+                    verdict.answers_different += 1;
+                    let say = |off, tells: &Option<String>| {
+                        let coast = if off { "coast" } else { "go on" };
+                        format!("its motors {coast} and it sends {}", tells.as_deref().unwrap_or("nothing"))
+                    };
+                    let (now, then) = (say(off, &tells), say(then.off, &then.tells));
+                    verdict.differs(&place, || format!("interrupted, {now} instead of {then}"));
+                }
             }
             Record::Polled(polled) => {
                 let Some(again) = computers.get_mut(&polled.computer) else { continue };

@@ -8,6 +8,7 @@ use crate::sil::tests::{Toy, image};
 use crate::sil::{SilConfig, run_watched};
 use composer_firmware::controller::BusKind;
 use composer_shared::policy::{IMAGE_SIZE, Policy, random_image};
+use composer_shared::wire::StopCommand;
 
 /// Log and transcript of runs with these faults.
 fn record(bus: BusKind, plans: &[&str]) -> (String, String) {
@@ -19,7 +20,12 @@ fn record(bus: BusKind, plans: &[&str]) -> (String, String) {
     let capture = Capture::new(&mut log, Format::Candump).unwrap().with_transcript(&mut transcript, &heading);
     for (number, plan) in plans.iter().enumerate() {
         let plan: FaultPlan = plan.parse().unwrap();
-        let config = SilConfig { faults: plan.draw(number as u64, 5), seed: number as u64, ..SilConfig::new(bus) };
+        let mut config = SilConfig { faults: plan.draw(number as u64, 5), seed: number as u64, ..SilConfig::new(bus) };
+        // The first is stopped and released on the way, and its stop input opens.
+        if number == 0 {
+            config.commands = vec![(600_000_000, StopCommand::Stop), (900_000_000, StopCommand::Release)];
+            config.presses = vec![(1_500_000_000, 2)];
+        }
         capture.begin_run();
         let recording = capture.recording(&launcher);
         run_watched(&recording, &mut Toy::new(5, 40), policy, &config, None, &mut &capture).unwrap();
@@ -50,6 +56,7 @@ fn a_module_does_the_same_again_whatever_happened_to_it() {
             let verdict = again(&image(), &log, &transcript, node).unwrap();
             assert_eq!((&verdict.first, &verdict.ended), (&None, &None), "node {node}");
             // Plugged in again twice.
+            assert!(verdict.interrupts >= 2, "{verdict:?}");
             assert_eq!((verdict.runs, verdict.starts), (5, if node == 2 { 7 } else { 5 }));
             assert!(verdict.frames >= 5 * 30 * 2 && verdict.torques == 2 * verdict.polls, "{verdict:?}");
         }
