@@ -16,6 +16,7 @@ use crate::env::EnvConfig;
 use crate::eval::DEFAULT_SEED;
 use crate::replay::Episode;
 use crate::stats::with_interval;
+use crate::vary::{self, Variation};
 
 /// Arguments of the demonstration.
 #[derive(clap::Args, Clone, Debug)]
@@ -41,13 +42,17 @@ pub struct OneTask {
     arguments: Arguments,
 }
 
-/// What goes wrong in the rows of the table for one task.
-const FAULTS: [(&str, &str); 5] = [
-    ("all modules", "none"),
-    ("one unplugged on the way", "unplug:1"),
-    ("two unplugged on the way", "unplug:2"),
-    ("the head unplugged at 1 s", "unplug:#0@1s"),
-    ("5 % of frames lost", "drop:0.05"),
+/// A row of the table for one task: what it is called, what goes wrong, and whether every episode has another robot and floor ([`vary::LAB`]).
+type Row = (&'static str, &'static str, bool);
+
+/// The rows of the table for one task; the first three are those of the table of all.
+const ROWS: [Row; 6] = [
+    ("all modules", "none", false),
+    ("one unplugged on the way", "unplug:1", false),
+    ("another robot and floor", "none", true),
+    ("two unplugged on the way", "unplug:2", false),
+    ("the head unplugged at 1 s", "unplug:#0@1s", false),
+    ("5 % of frames lost", "drop:0.05", false),
 ];
 
 /// A shipped policy and the environment it is made for.
@@ -67,10 +72,14 @@ impl Shipped {
     }
 
     /// Runs the episodes of a row; the first `record` of them are recorded.
-    fn run(&self, arguments: &Arguments, fault: &str, record: usize) -> Result<(BusReport, Vec<Episode>)> {
+    fn run(&self, arguments: &Arguments, (_, fault, varied): Row, record: usize) -> Result<(BusReport, Vec<Episode>)> {
         let fault: FaultPlan = fault.parse().with_context(|| format!("the fault {fault}"))?;
+        let mut config = self.config.clone();
+        if varied {
+            Arc::make_mut(&mut config).vary = Variation::from_toml(vary::LAB).map_err(anyhow::Error::msg)?;
+        }
         let trial = BusTrial {
-            config: self.config.clone(),
+            config,
             image: self.image,
             episodes: arguments.episodes as usize,
             seed: arguments.seed,
@@ -101,14 +110,15 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     header();
     let mut to_replay = Vec::new();
     for policy in &shipped {
-        for (label, fault) in &FAULTS[..2] {
-            let (report, recorded) = policy.run(arguments, fault, usize::from(*fault != "none"))?;
+        for shown in &ROWS[..3] {
+            let (label, fault, varied) = *shown;
+            let (report, recorded) = policy.run(arguments, *shown, usize::from(fault != "none" || varied))?;
             println!("{}", row(&format!("{}, {label}", policy.name), &report));
             to_replay.extend(recorded);
         }
     }
     write_replay(&first.config, "COMPOSER on the simulated bus", to_replay, "all that ship", &arguments.replay)?;
-    footer(arguments, first.config.cap(), "an episode of every task with a module unplugged");
+    footer(arguments, first.config.cap(), "an episode of every task with a module unplugged, and one on another robot");
     Ok(())
 }
 
@@ -123,8 +133,9 @@ pub fn run_one(one: &OneTask) -> Result<()> {
     );
     header();
     let mut to_replay = Vec::new();
-    for (label, fault) in FAULTS {
-        let (report, recorded) = policy.run(arguments, fault, if fault == "unplug:1" { REPLAYED } else { 0 })?;
+    for shown in ROWS {
+        let (label, fault, _) = shown;
+        let (report, recorded) = policy.run(arguments, shown, if fault == "unplug:1" { REPLAYED } else { 0 })?;
         println!("{}", row(label, &report));
         to_replay.extend(recorded);
     }
