@@ -16,4 +16,5 @@ pub mod policies;
 pub mod policy;
 pub mod registers;
 pub mod robot;
+pub mod update;
 pub mod wire;

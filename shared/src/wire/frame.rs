@@ -110,11 +110,15 @@ pub enum Function {
     Telemetry = 8,
     /// How a module is.
     Heartbeat = 9,
+    /// A piece of a new policy, for all modules (CAN-FD).
+    UpdateChunk = 10,
+    /// A ninth of it (classic CAN).
+    UpdatePiece = 11,
 }
 
 impl Function {
     /// All of them, most urgent first.
-    pub const ALL: [Function; 10] = [
+    pub const ALL: [Function; 12] = [
         Function::EmergencyStop,
         Function::Sync,
         Function::Goal,
@@ -125,6 +129,8 @@ impl Function {
         Function::ServiceResponse,
         Function::Telemetry,
         Function::Heartbeat,
+        Function::UpdateChunk,
+        Function::UpdatePiece,
     ];
 
     /// The function with this number, if there is one.
@@ -150,6 +156,8 @@ impl Function {
             Function::ServiceResponse => "SERVICE_RESPONSE",
             Function::Telemetry => "TELEMETRY",
             Function::Heartbeat => "HEARTBEAT",
+            Function::UpdateChunk => "UPDATE_CHUNK",
+            Function::UpdatePiece => "UPDATE_PIECE",
         }
     }
 }
@@ -197,7 +205,7 @@ impl fmt::Display for WireError {
         match *self {
             WireError::Identifier(id) => write!(f, "identifier {id:#x} has more than 11 bits"),
             WireError::UnknownFunction(n) => {
-                write!(f, "function {n} is not part of this protocol, which knows 0 to 9")
+                write!(f, "function {n} is not part of this protocol, which knows 0 to 11")
             }
             WireError::UnknownModule(m) => {
                 write!(f, "module {m} cannot be: modules are 0 to {}, the station is {STATION}", MAX_MODULES - 1)

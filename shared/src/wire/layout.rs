@@ -4,9 +4,10 @@ use core::fmt::{self, Write};
 
 use super::{
     EmergencyStop, Fault, Fragment, Frame, Function, Goal, Heartbeat, LATENT_SIZE, LatentMessage, LimitedBy, Mode,
-    Operation, STATION, ServiceCode, ServiceRequest, ServiceResponse, State, StopCommand, Sync, Telemetry,
+    Operation, Piece, STATION, ServiceCode, ServiceRequest, ServiceResponse, State, StopCommand, Sync, Telemetry,
 };
 use crate::robot::MAX_MODULES;
+use crate::update::{CHUNK_SIZE, ChunkRepr};
 
 /// Who may send a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -76,7 +77,7 @@ const fn signed(name: &'static str, count: u8, bits: u8, scale: f64, unit: &'sta
 }
 
 /// All frames, most urgent first.
-pub const LAYOUTS: [Layout; 10] = [
+pub const LAYOUTS: [Layout; 12] = [
     Layout {
         function: Function::EmergencyStop,
         senders: Senders::Both,
@@ -176,7 +177,8 @@ pub const LAYOUTS: [Layout; 10] = [
         senders: Senders::Modules,
         size: 8,
         fields: &[
-            unsigned("mode", 8),
+            unsigned("mode", 4),
+            unsigned("update", 4),
             unsigned("fault", 8),
             unsigned("health", 8),
             unsigned("time_keeper", 8),
@@ -184,6 +186,22 @@ pub const LAYOUTS: [Layout; 10] = [
             unsigned("firmware", 8),
             unsigned("policy", 16),
         ],
+    },
+    Layout {
+        function: Function::UpdateChunk,
+        senders: Senders::Station,
+        size: size_of::<ChunkRepr>(),
+        fields: &[
+            unsigned("session", 16),
+            unsigned("number", 16),
+            Field { count: CHUNK_SIZE as u8, ..unsigned("data", 8) },
+        ],
+    },
+    Layout {
+        function: Function::UpdatePiece,
+        senders: Senders::Station,
+        size: 8,
+        fields: &[unsigned("number4", 4), unsigned("index", 4), Field { count: 7, ..unsigned("data", 8) }],
     },
 ];
 
@@ -200,6 +218,8 @@ pub(super) fn of(function: Function) -> &'static Layout {
         Function::ServiceResponse => &LAYOUTS[7],
         Function::Telemetry => &LAYOUTS[8],
         Function::Heartbeat => &LAYOUTS[9],
+        Function::UpdateChunk => &LAYOUTS[10],
+        Function::UpdatePiece => &LAYOUTS[11],
     }
 }
 
@@ -226,19 +246,24 @@ const _: () = {
     check(7, Function::ServiceResponse, size_of::<ServiceResponse>());
     check(8, Function::Telemetry, size_of::<Telemetry>());
     check(9, Function::Heartbeat, size_of::<Heartbeat>());
+    check(10, Function::UpdateChunk, size_of::<ChunkRepr>());
+    check(11, Function::UpdatePiece, size_of::<Piece>());
 };
 
 /// Writes a DBC file of all frames of a robot with `modules` modules and its station, for candump users' tools (cantools,
 /// SavvyCAN, Kayak). On a CAN-FD bus (`fd`) every frame is an FD frame with bit-rate switch (`VFrameFormat` 14), the short ones
-/// too; on a classic bus there is no LATENT, and on an FD bus no LATENT_FRAGMENT.
+/// too; on a classic bus there is no LATENT and no UPDATE_CHUNK, and on an FD bus no LATENT_FRAGMENT and no UPDATE_PIECE.
 pub fn dbc(out: &mut impl Write, modules: u8, fd: bool) -> fmt::Result {
     let modules = modules.min(MAX_MODULES as u8);
     out.write_str("VERSION \"\"\n\nNS_ :\n\nBS_:\n\nBU_: STATION")?;
     (0..modules).try_for_each(|m| write!(out, " M{m}"))?;
     out.write_str("\n")?;
-    let foreign = if fd { Function::LatentFragment } else { Function::Latent };
+    let foreign = match fd {
+        true => [Function::LatentFragment, Function::UpdatePiece],
+        false => [Function::Latent, Function::UpdateChunk],
+    };
     let frames = || {
-        LAYOUTS.iter().filter(move |layout| layout.function != foreign).flat_map(move |layout| {
+        LAYOUTS.iter().filter(move |layout| !foreign.contains(&layout.function)).flat_map(move |layout| {
             let senders = (0..modules).chain([STATION]);
             senders.filter(|m| layout.senders.may_send(*m)).map(move |m| (layout, m))
         })

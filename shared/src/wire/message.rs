@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 use super::{Frame, Function, STATION, ServiceRequest, ServiceResponse, StopCount, WireError};
 use crate::robot::{AXES, MAX_JOINTS, MAX_MODULES};
+use crate::update::{CHUNKS_MAX, Chunk, ChunkRepr, PIECES};
 
 /// One step of a joint angle in STATE, rad.
 pub const ANGLE_LSB: f32 = core::f32::consts::PI / 2048.0;
@@ -336,7 +337,7 @@ impl Mode {
 /// HEARTBEAT: how a module is, also when its motors are relaxed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Heartbeat {
-    /// What the module is at ([`Mode`]).
+    /// What the module is at ([`Mode`], bits 0 to 3), and what it says of its policy (bits 4 to 7, [`Heartbeat::LAB`] and [`Heartbeat::TRIAL`]).
     pub mode: u8,
     /// The most serious active fault (lowest number of [`super::Fault`]), or 0.
     pub fault: u8,
@@ -352,6 +353,32 @@ pub struct Heartbeat {
     #[serde(with = "postcard::fixint::le")]
     pub policy: u16,
 }
+
+impl Heartbeat {
+    /// In [`Heartbeat::mode`]: the module has no key and takes policies that are not signed.
+    pub const LAB: u8 = 1 << 4;
+    /// In [`Heartbeat::mode`]: its policy is on trial.
+    pub const TRIAL: u8 = 1 << 5;
+
+    /// What the module is at.
+    pub fn mode(&self) -> Option<Mode> {
+        Mode::from_number(self.mode & 15)
+    }
+
+    /// Whether it has no key and takes policies that are not signed.
+    pub const fn lab(&self) -> bool {
+        self.mode & Heartbeat::LAB != 0
+    }
+
+    /// Whether its policy is on trial.
+    pub const fn on_trial(&self) -> bool {
+        self.mode & Heartbeat::TRIAL != 0
+    }
+}
+
+/// UPDATE_PIECE: a ninth of an UPDATE_CHUNK, see [`crate::update::Assembly`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Piece(pub [u8; 8]);
 
 /// Every message there is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -377,6 +404,10 @@ pub enum Message {
     Telemetry(Telemetry),
     /// How a module is.
     Heartbeat(Heartbeat),
+    /// A piece of a new policy.
+    UpdateChunk(ChunkRepr),
+    /// A ninth of it.
+    UpdatePiece(Piece),
 }
 
 impl Message {
@@ -393,11 +424,13 @@ impl Message {
             Message::ServiceResponse(_) => Function::ServiceResponse,
             Message::Telemetry(_) => Function::Telemetry,
             Message::Heartbeat(_) => Function::Heartbeat,
+            Message::UpdateChunk(_) => Function::UpdateChunk,
+            Message::UpdatePiece(_) => Function::UpdatePiece,
         }
     }
 
-    /// The frame in which `module` (or the station) says this, classic or FD with bit-rate switch. A LATENT needs FD
-    /// and is always an FD frame; on a classic bus send [`LatentMessage::fragments`].
+    /// The frame in which `module` (or the station) says this, classic or FD with bit-rate switch. A LATENT and an UPDATE_CHUNK need FD
+    /// and are always FD frames; on a classic bus send [`LatentMessage::fragments`] and [`ChunkRepr::pieces`].
     pub fn emit(&self, module: u8, fd: bool) -> Frame {
         let mut data = [0; 64];
         let size = match self {
@@ -411,9 +444,15 @@ impl Message {
             Message::ServiceResponse(m) => encode_into(m, &mut data),
             Message::Telemetry(m) => encode_into(m, &mut data),
             Message::Heartbeat(m) => encode_into(m, &mut data),
+            Message::UpdateChunk(m) => {
+                let bytes = m.emit();
+                data.iter_mut().zip(bytes).for_each(|(to, from)| *to = from);
+                bytes.len()
+            }
+            Message::UpdatePiece(m) => encode_into(m, &mut data),
         };
         let function = self.function();
-        let fd = fd || function == Function::Latent;
+        let fd = fd || matches!(function, Function::Latent | Function::UpdateChunk);
         let len = Frame::padded_len(size, fd).unwrap_or(8);
         Frame { id: function.id(module), fd, brs: fd, len, data }
     }
@@ -490,10 +529,28 @@ impl Message {
             Function::Heartbeat => {
                 let m: Heartbeat = decode(function, body)?;
                 module_or_none("time-keeper", m.time_keeper)?;
-                if Mode::from_number(m.mode).is_none() {
+                if m.mode().is_none() {
                     return wrong("mode", m.mode);
                 }
+                reserved(m.mode & !(15 | Heartbeat::LAB | Heartbeat::TRIAL))?;
                 Message::Heartbeat(m)
+            }
+            Function::UpdateChunk => {
+                let [_, _, low, high, ..] = frame.data;
+                let number = u16::from_le_bytes([low, high]);
+                match Chunk::new_checked(body) {
+                    Some(chunk) => Message::UpdateChunk(chunk.repr()),
+                    None if usize::from(number) >= CHUNKS_MAX => return wrong("number", high),
+                    None => return Err(WireError::WrongLength { function, got: frame.len, expected }),
+                }
+            }
+            Function::UpdatePiece => {
+                let m: Piece = decode(function, body)?;
+                let [head, ..] = m.0;
+                if usize::from(head >> 4) >= PIECES {
+                    return wrong("index", head >> 4);
+                }
+                Message::UpdatePiece(m)
             }
         })
     }

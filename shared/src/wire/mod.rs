@@ -24,13 +24,13 @@ pub use frame::{Frame, Function, STATION, WireError};
 pub use layout::{Field, LAYOUTS, Layout, Senders, dbc};
 pub use message::{
     ANGLE_LSB, EmergencyStop, FRAGMENTS, Fragment, GOAL_LSB, GOAL_POINTS, Goal, Health, Heartbeat, LATENT_SIZE,
-    LatentMessage, Message, Mode, NOBODY, State, StopCommand, Sync, Telemetry, quantise_angle,
+    LatentMessage, Message, Mode, NOBODY, Piece, State, StopCommand, Sync, Telemetry, quantise_angle,
 };
-pub use service::{ALL_MODULES, Operation, ServiceCode, ServiceRequest, ServiceResponse};
+pub use service::{ALL_MODULES, Operation, ServiceCode, ServiceRequest, ServiceResponse, UpdateStep};
 pub use stop::{StopCount, StopLatch};
 
 /// Version of this format; travels in every HEARTBEAT. It changes when a byte of an existing frame changes its meaning.
-pub const PROTOCOL_VERSION: u8 = 2;
+pub const PROTOCOL_VERSION: u8 = 3;
 
 #[cfg(test)]
 mod tests;

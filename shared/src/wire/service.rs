@@ -84,11 +84,55 @@ pub enum Operation {
     ClearLog = 12,
     /// Restart.
     Restart = 13,
+    /// Change the policy; the index selects the step ([`UpdateStep`]).
+    Update = 14,
+    /// How far an update is; the index selects the item.
+    UpdateStatus = 15,
+    /// Read a record of what became of the policies.
+    UpdateLog = 16,
+}
+
+/// Steps of [`Operation::Update`]. Numbers never change their meaning.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum UpdateStep {
+    /// A new policy comes; value: session (bits 0 to 15) and bytes of header and image (16 to 31).
+    Begin = 0,
+    /// All chunks were sent: check the policy; value: its CRC-32.
+    Verify = 1,
+    /// Try it from the next start on; value: its CRC-32.
+    Commit = 2,
+    /// It works: keep it; value: its CRC-32.
+    Confirm = 3,
+    /// Forget what was received, or was to be tried and is not tried yet.
+    Abandon = 4,
+}
+
+impl UpdateStep {
+    /// All of them.
+    pub const ALL: [UpdateStep; 5] =
+        [UpdateStep::Begin, UpdateStep::Verify, UpdateStep::Commit, UpdateStep::Confirm, UpdateStep::Abandon];
+
+    /// The step with this number.
+    pub fn from_number(number: u8) -> Option<Self> {
+        Self::ALL.into_iter().find(|step| *step as u8 == number)
+    }
+
+    /// The name that `wire-format.md` uses.
+    pub const fn name(self) -> &'static str {
+        match self {
+            UpdateStep::Begin => "begin",
+            UpdateStep::Verify => "verify",
+            UpdateStep::Commit => "commit",
+            UpdateStep::Confirm => "confirm",
+            UpdateStep::Abandon => "abandon",
+        }
+    }
 }
 
 impl Operation {
     /// All of them.
-    pub const ALL: [Operation; 13] = [
+    pub const ALL: [Operation; 16] = [
         Operation::Hello,
         Operation::Arm,
         Operation::Disarm,
@@ -102,6 +146,9 @@ impl Operation {
         Operation::Log,
         Operation::ClearLog,
         Operation::Restart,
+        Operation::Update,
+        Operation::UpdateStatus,
+        Operation::UpdateLog,
     ];
 
     /// The operation with this number.
@@ -125,6 +172,9 @@ impl Operation {
             Operation::Log => "LOG",
             Operation::ClearLog => "CLEAR_LOG",
             Operation::Restart => "RESTART",
+            Operation::Update => "UPDATE",
+            Operation::UpdateStatus => "UPDATE_STATUS",
+            Operation::UpdateLog => "UPDATE_LOG",
         }
     }
 }
@@ -155,11 +205,33 @@ pub enum ServiceCode {
     Busy = 9,
     /// Another station is at work.
     AnotherStation = 10,
+    /// No update of this session or policy is under way.
+    NoUpdate = 11,
+    /// Chunks are missing.
+    Missing = 12,
+    /// The header is damaged, or of another version.
+    NotSignedPolicy = 13,
+    /// The policy is for another class of device.
+    WrongClass = 14,
+    /// The security counter is lower than the module's.
+    OldCounter = 15,
+    /// The policy is not signed, and the module has a key.
+    Unsigned = 16,
+    /// None of the module's keys signed it, or it was changed afterwards.
+    BadSignature = 17,
+    /// The image is not the one that was signed.
+    BadDigest = 18,
+    /// The image is none that this firmware runs.
+    BadPolicy = 19,
+    /// A policy is on trial.
+    OnTrial = 20,
+    /// The module has a key.
+    Locked = 21,
 }
 
 impl ServiceCode {
     /// All of them.
-    pub const ALL: [ServiceCode; 11] = [
+    pub const ALL: [ServiceCode; 22] = [
         ServiceCode::Ok,
         ServiceCode::UnknownOperation,
         ServiceCode::NoSuchRegister,
@@ -171,6 +243,17 @@ impl ServiceCode {
         ServiceCode::StorageFailed,
         ServiceCode::Busy,
         ServiceCode::AnotherStation,
+        ServiceCode::NoUpdate,
+        ServiceCode::Missing,
+        ServiceCode::NotSignedPolicy,
+        ServiceCode::WrongClass,
+        ServiceCode::OldCounter,
+        ServiceCode::Unsigned,
+        ServiceCode::BadSignature,
+        ServiceCode::BadDigest,
+        ServiceCode::BadPolicy,
+        ServiceCode::OnTrial,
+        ServiceCode::Locked,
     ];
 
     /// The code with this number.
@@ -194,6 +277,21 @@ impl ServiceCode {
             ServiceCode::StorageFailed => "the flash could not be written: what was stored before is unchanged",
             ServiceCode::Busy => "the module is still busy with another request: ask again",
             ServiceCode::AnotherStation => "another station is at work: end it first",
+            ServiceCode::NoUpdate => "no update of this session or policy is under way: begin it",
+            ServiceCode::Missing => "chunks are missing: send them again",
+            ServiceCode::NotSignedPolicy => {
+                "what was received is no signed policy: its header is damaged or of another version"
+            }
+            ServiceCode::WrongClass => "the policy is for another class of device",
+            ServiceCode::OldCounter => "its security counter is lower than the module's: sign a newer policy",
+            ServiceCode::Unsigned => "the policy is not signed and the module has a key: sign it with `snakectl sign`",
+            ServiceCode::BadSignature => "none of the module's keys signed the policy, or it was changed afterwards",
+            ServiceCode::BadDigest => "the image is not the one that the header names",
+            ServiceCode::BadPolicy => "the image is no policy that this firmware runs",
+            ServiceCode::OnTrial => "a policy is on trial: confirm it, or wait until it is given up",
+            ServiceCode::Locked => {
+                "a module with a key takes no changes of its node page over the bus: use the debug probe"
+            }
         }
     }
 }

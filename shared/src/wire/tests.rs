@@ -9,6 +9,7 @@ use proptest::prelude::*;
 use super::*;
 use crate::registers::Register;
 use crate::robot::MAX_MODULES;
+use crate::update::ChunkRepr;
 
 const DOCUMENT: &str = include_str!("../../wire-format.md");
 
@@ -23,6 +24,10 @@ fn latent() -> LatentMessage {
     let mut key = core::array::from_fn(|i| i as i8);
     (key[0], key[1], key[2]) = (127, -128, 1);
     LatentMessage { cycle: 0x34, health: Health(3), policy: 0x1234, key, value: core::array::from_fn(|i| -(i as i8)) }
+}
+
+fn chunk() -> ChunkRepr {
+    ChunkRepr { session: 0xabcd, number: 3, data: core::array::from_fn(|i| i as u8) }
 }
 
 /// Every message, with the bytes that the document shows.
@@ -99,7 +104,7 @@ fn examples() -> Vec<(Message, u8, &'static str)> {
         ),
         (
             Message::Heartbeat(Heartbeat {
-                mode: Mode::Relaxed as u8,
+                mode: Mode::Relaxed as u8 | Heartbeat::LAB,
                 fault: Fault::SyncLost as u8,
                 health: Health::SENSORS_PLAUSIBLE.with(Health::FAULT),
                 time_keeper: 0,
@@ -108,8 +113,9 @@ fn examples() -> Vec<(Message, u8, &'static str)> {
                 policy: 0x1234,
             }),
             3,
-            "483#0222090002013412"
+            "483#1222090003013412"
         ),
+        (Message::UpdatePiece(Piece(chunk().pieces()[0])), STATION, "5FF#03CDAB0300000102"),
     ]
 }
 
@@ -146,6 +152,14 @@ fn a_latent_fills_one_fd_frame() {
 }
 
 #[test]
+fn a_chunk_fills_one_fd_frame() {
+    let emitted = Message::UpdateChunk(chunk()).emit(STATION, false);
+    assert_eq!((emitted.id, emitted.fd, emitted.len), (0x57f, true, 64));
+    assert_eq!((&emitted.data[..6], &emitted.data[58..62]), (&[0xcd, 0xab, 3, 0, 0, 1][..], &[54, 55, 0, 0][..]));
+    assert_eq!(Message::parse(&emitted), Ok(Message::UpdateChunk(chunk())));
+}
+
+#[test]
 fn angles_survive_within_half_a_step() {
     for step in -5000..5000 {
         let angle = step as f32 * 0.001;
@@ -173,7 +187,7 @@ fn whatever_is_not_exactly_right_is_refused_with_its_reason() {
     let cases: &[(&str, WireError)] = &[
         ("183#00", WireError::WrongLength { function: Function::State, got: 1, expected: 8 }),
         ("203#0000000000000000", WireError::WrongLength { function: Function::Latent, got: 8, expected: 64 }),
-        ("500#", WireError::UnknownFunction(10)),
+        ("600#", WireError::UnknownFunction(12)),
         ("7FF#0000", WireError::UnknownFunction(15)),
         ("1C0#0000000000000000", WireError::UnknownModule(64)),
         ("1FE#0000000000000000", WireError::UnknownModule(126)),
@@ -193,6 +207,10 @@ fn whatever_is_not_exactly_right_is_refused_with_its_reason() {
         ("3FF#0000000000000000", WireError::WrongSender { function: Function::ServiceResponse, module: STATION }),
         ("283#8000000000000000", WireError::ReservedBits(Function::LatentFragment)),
         ("403#0000000000004000", WireError::WrongValue { function: Function::Telemetry, field: "module", value: 64 }),
+        ("483#4200000000000000", WireError::ReservedBits(Function::Heartbeat)),
+        ("583#0000000000000000", WireError::WrongSender { function: Function::UpdatePiece, module: 3 }),
+        ("57F#0000000000000000", WireError::WrongLength { function: Function::UpdateChunk, got: 8, expected: 64 }),
+        ("5FF#9000000000000000", WireError::WrongValue { function: Function::UpdatePiece, field: "index", value: 9 }),
         ("483#0700000000000000", WireError::WrongValue { function: Function::Heartbeat, field: "mode", value: 7 }),
         (
             "483#0000004000000000",
@@ -206,6 +224,10 @@ fn whatever_is_not_exactly_right_is_refused_with_its_reason() {
     let mut latent = Message::Latent(latent()).emit(0, true);
     latent.data[63] = 1;
     assert_eq!(Message::parse(&latent), Err(WireError::ReservedBits(Function::Latent)));
+    let mut much = Message::UpdateChunk(chunk()).emit(STATION, true);
+    much.data[3] = 2;
+    let wrong = WireError::WrongValue { function: Function::UpdateChunk, field: "number", value: 2 };
+    assert_eq!(Message::parse(&much), Err(wrong));
     let long = Frame { id: 0x880, fd: false, brs: false, len: 8, data: [0; 64] };
     assert_eq!(Message::parse(&long), Err(WireError::Identifier(0x880)));
     assert_eq!(
@@ -339,8 +361,8 @@ fn the_dbc_file_lists_every_frame_of_its_bus_once() {
             .filter_map(|l| l.strip_prefix("BO_ "))
             .map(|l| l.split(' ').next().unwrap().parse().unwrap())
             .collect();
-        // Seven functions of eight modules; the station's GOAL, EMERGENCY_STOP and SERVICE_REQUEST.
-        assert_eq!(ids.len(), 7 * 8 + 3);
+        // Seven functions of eight modules; the station's GOAL, EMERGENCY_STOP, SERVICE_REQUEST, and UPDATE_CHUNK or UPDATE_PIECE.
+        assert_eq!(ids.len(), 7 * 8 + 4);
         assert!(ids.windows(2).all(|w| w[0] < w[1]));
         assert_eq!(text.contains("BO_ 515 LATENT_M3: 64 M3\n"), fd);
         assert_eq!(text.contains("BO_ 643 LATENT_FRAGMENT_M3: 8 M3\n"), !fd);
@@ -361,7 +383,7 @@ proptest! {
     /// No bytes make the parser panic, and what it accepts is written back as the same frame.
     #[test]
     fn any_frame_is_refused_or_understood_completely(
-        id in prop_oneof![9 => 0u16..0x500, 1 => any::<u16>()],
+        id in prop_oneof![9 => 0u16..0x600, 1 => any::<u16>()],
         fd in any::<bool>(),
         len in prop_oneof![4 => Just(8u8), 1 => Just(3u8), 1 => Just(4u8), 2 => Just(64u8), 1 => any::<u8>()],
         mut data in prop::array::uniform32(any::<u8>()),
