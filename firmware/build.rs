@@ -33,6 +33,7 @@ fn main() {
             ("_flash_size", memory_map::FLASH_SIZE),
             ("_policy_address", memory_map::POLICY_ADDRESS),
             ("_policy_size", memory_map::POLICY_SIZE),
+            ("_records_address", memory_map::RECORDS_ADDRESS),
             ("_storage_address", memory_map::STORAGE_ADDRESS),
             ("_storage_size", memory_map::STORAGE_SIZE),
             ("_node_page_address", memory_map::NODE_PAGE_ADDRESS),

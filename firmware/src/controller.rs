@@ -462,6 +462,8 @@ pub struct Controller<'a> {
     cycle_start: Option<Micros>,
     phase: Phase,
     power: Power,
+    /// Beside the mode in HEARTBEAT.
+    remark: u8,
     sample: Sensors,
     /// Of the policy: empty at power-up, and where the robot begins to move.
     memory: Memory,
@@ -522,6 +524,7 @@ impl<'a> Controller<'a> {
             cycle_start: None,
             phase: Phase::Done,
             power: Power::default(),
+            remark: 0,
             sample: Sensors::ZERO,
             memory: Memory::EMPTY,
             encoded: None,
@@ -581,6 +584,11 @@ impl<'a> Controller<'a> {
     /// Tells what the board measured of supply and motors; it counts from the next poll on, until it is told anew. A board that never does has a good supply.
     pub fn set_power(&mut self, power: Power) {
         self.power = power;
+    }
+
+    /// What HEARTBEAT is to say of the policy: [`Heartbeat::LAB`], [`Heartbeat::TRIAL`].
+    pub fn set_remark(&mut self, remark: u8) {
+        self.remark = remark & (Heartbeat::LAB | Heartbeat::TRIAL);
     }
 
     /// Supply and cut-offs.
@@ -837,7 +845,7 @@ impl<'a> Controller<'a> {
     /// What HEARTBEAT would say now.
     pub fn heartbeat(&self) -> Heartbeat {
         Heartbeat {
-            mode: self.mode() as u8,
+            mode: self.mode() as u8 | self.remark,
             fault: self.faults().number(),
             health: self.health(),
             time_keeper: self.time_keeper.unwrap_or(NOBODY),
@@ -906,7 +914,11 @@ impl<'a> Controller<'a> {
         }
         self.neighbours.hear(module);
         let heard = match message {
-            Message::EmergencyStop(_) | Message::Telemetry(_) | Message::ServiceResponse(_) => Heard::Now,
+            Message::EmergencyStop(_)
+            | Message::Telemetry(_)
+            | Message::ServiceResponse(_)
+            | Message::UpdateChunk(_)
+            | Message::UpdatePiece(_) => Heard::Now,
             Message::ServiceRequest(request) => {
                 self.serve(&request);
                 Heard::Now

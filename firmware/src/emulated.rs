@@ -8,11 +8,12 @@
 use composer_shared::observation::Sensors;
 use composer_shared::policy::Policy;
 use composer_shared::robot::{AXES, MAX_JOINTS};
+use composer_shared::update::{NO_KEY, Slot};
 use composer_shared::wire::Frame;
 use nalgebra::{Matrix3, Vector3};
 
 use crate::boot::{Boot, ResetCause};
-use crate::controller::{BusKind, BusStatus, Config, ConfigError, Controller, Micros, Outputs};
+use crate::controller::{BusKind, BusStatus, Config, ConfigError, Controller, Micros, Outputs, Timing};
 use crate::drivers::encoder::{JointCalibration, STEPS};
 use crate::node_page::{Calibration, NodePage};
 use crate::port::PortStatus;
@@ -20,19 +21,33 @@ use crate::safety::Safety;
 use crate::service::{Board, Raw, Service};
 use crate::storage::{RamFlash, read_page};
 use crate::torque_off::{Interrupt, TorqueOff};
+use crate::update::{PolicyFlash, Updater, image_of};
 
 /// Bytes of an emulated flash.
 const FLASH_SIZE: usize = 4 * 256;
 /// The supply of a simulated robot, V.
 const SUPPLY: f32 = 12.0;
 
+/// Flash with policies whose images stay where they are for as long as `'a`: a controller borrows its policy.
+pub trait Lasting<'a>: PolicyFlash {
+    /// The image in a slot. The slot must not be written while a controller runs with it; [`Updater`] never does.
+    fn lasting(&mut self, slot: Slot) -> Option<&'a [u8]>;
+}
+
+impl<'a> Lasting<'a> for crate::update::NoPolicies {
+    fn lasting(&mut self, _: Slot) -> Option<&'a [u8]> {
+        None
+    }
+}
+
 /// What stands for the hardware of a module.
 #[derive(Clone, Debug)]
-pub struct Hardware {
+pub struct Hardware<F> {
     /// How encoders, inertial sensor and motors really are.
     pub mounted: Calibration,
     unique_id: [u32; 3],
     storage: RamFlash<FLASH_SIZE>,
+    policies: F,
     /// What is true now.
     truth: Sensors,
     /// Torque for which [`Sensors::torque`] says 1.
@@ -40,15 +55,18 @@ pub struct Hardware {
     bus: BusStatus,
 }
 
-impl Hardware {
-    const OFF: Hardware = Hardware {
-        mounted: Calibration::NOMINAL,
-        unique_id: [0; 3],
-        storage: RamFlash::ERASED,
-        truth: Sensors::ZERO,
-        torque_limit: 1.0,
-        bus: BusStatus::ErrorActive,
-    };
+impl<F> Hardware<F> {
+    fn off(policies: F) -> Self {
+        Hardware {
+            mounted: Calibration::NOMINAL,
+            unique_id: [0; 3],
+            storage: RamFlash::ERASED,
+            policies,
+            truth: Sensors::ZERO,
+            torque_limit: 1.0,
+            bus: BusStatus::ErrorActive,
+        }
+    }
 
     /// What the module senses if its page says that it is calibrated like this.
     fn sensed(&self, page: &Calibration) -> Sensors {
@@ -95,8 +113,13 @@ fn reading(mounted: &JointCalibration, angle: f32) -> Option<u16> {
     Some(steps.wrapping_add(mounted.zero.into()).rem_euclid(STEPS.into()) as u16)
 }
 
-impl Board for Hardware {
+impl<F: PolicyFlash> Board for Hardware<F> {
     type Flash = RamFlash<FLASH_SIZE>;
+    type Policies = F;
+
+    fn policies(&mut self) -> &mut F {
+        &mut self.policies
+    }
 
     fn storage(&mut self) -> &mut Self::Flash {
         &mut self.storage
@@ -132,16 +155,19 @@ impl Board for Hardware {
     }
 }
 
-/// Things to do with the flash at most: a page in two places, and a few entries of the log.
-const MOST_WORK: usize = 16;
+/// Things to do with the flash at most: a slot to be erased, or a policy to be verified; a page in two places and a few entries of the log are less.
+const MOST_WORK: usize = 48;
 /// How long a module sleeps that cannot start, us.
 const SLEEP_US: u64 = 1_000_000;
 
 /// A module without hardware.
 #[derive(Clone, Debug)]
-pub struct Emulated<'a> {
+pub struct Emulated<'a, F> {
+    /// The policy that it was made with, in slot A until another is confirmed.
+    born: Policy<'a>,
+    /// The one that it runs with.
     policy: Policy<'a>,
-    hardware: Hardware,
+    hardware: Hardware<F>,
     /// What the simulator wants it to be.
     config: Option<Config>,
     /// The page that its first start had, and the one that counts.
@@ -152,7 +178,7 @@ pub struct Emulated<'a> {
 }
 
 /// Flash that is memory takes no time: what is on its way gets there at once.
-fn settle(service: &mut Service, controller: &Controller<'_>, hardware: &mut Hardware) {
+fn settle<F: PolicyFlash>(service: &mut Service, controller: &mut Controller<'_>, hardware: &mut Hardware<F>) {
     for _ in 0..MOST_WORK {
         if !service.is_busy() {
             break;
@@ -169,17 +195,19 @@ fn first_page(config: &Config, mounted: Calibration) -> NodePage {
         bus_off: config.bus_off,
         safety: config.safety,
         calibration: mounted,
+        keys: [NO_KEY; 2],
     };
     // A simulated robot may keep to less than a page can say.
     if page.check().is_ok() { page } else { NodePage { safety: Safety::BOARD, ..page } }
 }
 
-impl<'a> Emulated<'a> {
-    /// A module that is off.
-    pub fn new(policy: Policy<'a>) -> Self {
+impl<'a, F: Lasting<'a>> Emulated<'a, F> {
+    /// A module that is off, made with this policy, and its flash for others.
+    pub fn new(policy: Policy<'a>, policies: F) -> Self {
         Emulated {
+            born: policy,
             policy,
-            hardware: Hardware::OFF,
+            hardware: Hardware::off(policies),
             config: None,
             pages: [None; 2],
             controller: None,
@@ -188,16 +216,14 @@ impl<'a> Emulated<'a> {
         }
     }
 
-    /// It starts, for this reason, with new flash, its hardware mounted like this, and a page that says so.
+    /// It starts, for this reason, with new storage, its hardware mounted like this, and a page that says so. Its policies stay.
     pub fn start(&mut self, config: Config, boot: Boot, now: Micros, mounted: Calibration) -> Result<(), ConfigError> {
         let page = first_page(&config, mounted);
-        self.hardware = Hardware {
-            mounted,
-            // "SIM", and the place where it was made.
-            unique_id: [0x004d_4953, 0, config.node.into()],
-            torque_limit: self.policy.limits().torque,
-            ..Hardware::OFF
-        };
+        self.hardware.mounted = mounted;
+        // "SIM", and the place where it was made.
+        self.hardware.unique_id = [0x004d_4953, 0, config.node.into()];
+        (self.hardware.storage, self.hardware.truth) = (RamFlash::ERASED, Sensors::ZERO);
+        self.hardware.bus = BusStatus::ErrorActive;
         self.pages = [Some(page); 2];
         let begun = self.begin(config, page, boot, now);
         self.config = begun.is_ok().then_some(config);
@@ -226,16 +252,38 @@ impl<'a> Emulated<'a> {
     fn begin(&mut self, config: Config, page: NodePage, boot: Boot, now: Micros) -> Result<(), ConfigError> {
         // First make room: two controllers are too much for the stack of an emulated module.
         (self.controller, self.service) = (None, None);
-        let controller = self.controller.insert(Controller::new(config, self.policy, boot, now)?);
+        let usable = |flash: &F, slot| image_of(flash, slot).is_some_and(|image| Policy::parse(image).is_ok());
+        let updater = Updater::start(&mut self.hardware.policies, page.keys, usable);
+        let slot = updater.started().slot;
+        let policy = if slot == Slot::A && !updater.records().state().confirmed {
+            self.born
+        } else {
+            // Without its policy a module does not start.
+            let image = self.hardware.policies.lasting(slot).map(Policy::parse);
+            let Some(Ok(policy)) = image else { return Ok(()) };
+            policy
+        };
+        let mut config = config;
+        if config.timing == Timing::for_policy(&self.born, config.bus, config.modules) {
+            config.timing = Timing::for_policy(&policy, config.bus, config.modules);
+        }
+        self.policy = policy;
+        self.hardware.torque_limit = policy.limits().torque;
+        let controller = self.controller.insert(Controller::new(config, policy, boot, now)?);
         self.torque_off.restart(controller.stop_latch());
-        let service = self.service.insert(Service::new(page, controller, now, &mut self.hardware));
+        let service = self.service.insert(Service::new(page, updater, controller, now, &mut self.hardware));
         settle(service, controller, &mut self.hardware);
         Ok(())
     }
 
     /// Its hardware.
-    pub fn hardware(&mut self) -> &mut Hardware {
+    pub fn hardware(&mut self) -> &mut Hardware<F> {
         &mut self.hardware
+    }
+
+    /// The policy that it runs with.
+    pub fn policy(&self) -> &Policy<'a> {
+        &self.policy
     }
 
     /// Whether it was ever switched on.
@@ -309,6 +357,7 @@ impl<'a> Emulated<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::update::NoPolicies;
     use composer_shared::policy::{IMAGE_SIZE, random_image};
     use composer_shared::registers::Register;
     use composer_shared::wire::{Message, Operation, STATION, ServiceCode, ServiceRequest};
@@ -326,7 +375,7 @@ mod tests {
     }
 
     struct Rig<'a> {
-        module: Emulated<'a>,
+        module: Emulated<'a, NoPolicies>,
         now: Micros,
         sequence: u8,
     }
@@ -384,7 +433,7 @@ mod tests {
 
     fn rig(image: &[u8], mounted: Calibration) -> Rig<'_> {
         let policy = Policy::parse(image).unwrap();
-        let mut module = Emulated::new(policy);
+        let mut module = Emulated::new(policy, NoPolicies);
         assert!(!module.is_started());
         module.start(Config::new(3, 8, BusKind::Fd, &policy), Boot::default(), 0, mounted).unwrap();
         let mut rig = Rig { module, now: 0, sequence: 0 };

@@ -39,3 +39,4 @@ pub mod storage;
 pub mod supply;
 pub mod torque_off;
 pub mod trips;
+pub mod update;

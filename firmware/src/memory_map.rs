@@ -4,7 +4,7 @@
 //! | region | from | bytes | content |
 //! |---|---|---|---|
 //! | code | 0x0800_0000 | 432 K | the image |
-//! | policy | 0x0806_c000 | 64 K | a policy image ([`composer_shared::policy`]) |
+//! | policy | 0x0806_c000 | 64 K | the policies (`update`): slots A and B of 28 K, and 8 K of records that say which counts |
 //! | storage | 0x0807_c000 | 16 K | what the module writes itself (`storage`): 8 K fault log, 4 K copy of the node page, and last: |
 //! | node page | 0x0807_f000 | 4 K | what makes this module this module (`node_page`) |
 //!
@@ -15,10 +15,12 @@
 pub const FLASH_ADDRESS: u32 = 0x0800_0000;
 /// Bytes of flash for code and constants.
 pub const FLASH_SIZE: u32 = 432 * 1024;
-/// Where the policy image lies.
+/// Where the policies lie: slot A, slot B, their records.
 pub const POLICY_ADDRESS: u32 = FLASH_ADDRESS + FLASH_SIZE;
-/// Most bytes that a policy image may have.
+/// Bytes of all of it.
 pub const POLICY_SIZE: u32 = 64 * 1024;
+/// Where the records lie.
+pub const RECORDS_ADDRESS: u32 = POLICY_ADDRESS + 56 * 1024;
 /// Where the module keeps what it writes itself: four sections, the last of which is the node page.
 pub const STORAGE_ADDRESS: u32 = POLICY_ADDRESS + POLICY_SIZE;
 /// From one section of the storage to the next: what the chip may erase at once.

@@ -2,15 +2,15 @@
 //! ([`crate::memory_map`]), is written by the host (`snakectl flash`) and read by the board at power-up, so that all modules run the
 //! same image and the same policy.
 //!
-//! # Layout, version 2
+//! # Layout, version 3
 //!
-//! 184 bytes, all numbers little-endian; `f32` is IEEE 754 binary32. "Not a number" and infinities lie outside of every range. Torque is in the robot's
+//! 248 bytes, all numbers little-endian; `f32` is IEEE 754 binary32. "Not a number" and infinities lie outside of every range. Torque is in the robot's
 //! torque unit.
 //!
 //! | offset | type | field | accepted |
 //! |---|---|---|---|
 //! | 0 | u8\[8\] | magic | the ASCII characters `COMPNODE` |
-//! | 8 | u16 | layout version | 2 |
+//! | 8 | u16 | layout version | 3 |
 //! | 10 | u8 | number of this module, 0 is the head | 0 to modules - 1 |
 //! | 11 | u8 | modules of the robot | 1 to 64 |
 //! | 12 | u8 | after bus-off: 0 recover, 1 stay off until a restart | 0, 1 |
@@ -35,16 +35,21 @@
 //! | 140 + 28 m | f32 | current sense: A from one end of the converter's range to the other; negative if it is turned | magnitude 0.001 to 1000 |
 //! | 144 + 28 m | f32 | current sense: reading without current, part of the range | 0 to 1 |
 //! | 176 | u32 | reserved | 0 |
-//! | 180 | u32 | CRC-32 (ISO-HDLC) of bytes 0 to 179 | |
+//! | 180 | u8\[32\] | key A: Ed25519 public key of who may change the policy; 0 none | all |
+//! | 212 | u8\[32\] | key B, likewise: for the time in which keys are changed | all |
+//! | 244 | u32 | CRC-32 (ISO-HDLC) of bytes 0 to 243 | |
 //!
 //! A joint may not be allowed all of half a turn: an encoder of a single turn could not tell its ends apart. Nor may the cut-off lie where the current sense
 //! has no more readings: it could never happen.
 //!
-//! Version 1 had no limits; a page of it is refused, because nobody said how far the joints of its module may go.
+//! A module without a key takes policies that nobody signed, and says so in HEARTBEAT (`threat-model.md`).
+//!
+//! Version 1 had no limits, and version 2 no keys; pages of them are refused, because nobody said how far the joints of the module may go, or who may change its policy.
 
 use core::fmt;
 
 use composer_shared::robot::{AXES, MAX_JOINTS, MAX_MODULES};
+use composer_shared::update::{KEY_SIZE, Key};
 use crc::{CRC_32_ISO_HDLC, Crc};
 
 use crate::drivers::encoder::{JointCalibration, STEPS};
@@ -54,9 +59,9 @@ use crate::safety::Safety;
 use crate::supply::Thresholds;
 
 /// Bytes of a node page; a multiple of 8, the least that the flash writes.
-pub const SIZE: usize = 184;
+pub const SIZE: usize = 248;
 /// Version of the layout that this code reads and writes.
-pub const VERSION: u16 = 2;
+pub const VERSION: u16 = 3;
 /// The first bytes of every node page.
 pub const MAGIC: [u8; 8] = *b"COMPNODE";
 
@@ -74,7 +79,8 @@ const SUPPLY_AT: usize = CAPS_AT + 3 * 4;
 const MOTORS_AT: usize = SUPPLY_AT + 2 * 4;
 const MOTOR_SIZE: usize = 7 * 4;
 const RESERVED_AT: usize = MOTORS_AT + MOTOR_SIZE * AXES;
-const CRC_AT: usize = RESERVED_AT + 4;
+const KEYS_AT: usize = RESERVED_AT + 4;
+const CRC_AT: usize = KEYS_AT + 2 * KEY_SIZE;
 const _: () = assert!(CRC_AT + 4 == SIZE);
 
 pub(crate) const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
@@ -163,6 +169,8 @@ pub struct NodePage {
     pub safety: Safety,
     /// What was measured.
     pub calibration: Calibration,
+    /// Who may change its policy: Ed25519 public keys, or [`composer_shared::update::NO_KEY`].
+    pub keys: [Key; 2],
 }
 
 /// Why a node page is refused.
@@ -209,6 +217,10 @@ impl fmt::Display for NodePageError {
             Self::Version { found: 1 } => write!(
                 f,
                 "the node page has layout version 1, which says nothing of limits, and this build reads version {VERSION}: write it again with `snakectl flash`"
+            ),
+            Self::Version { found: 2 } => write!(
+                f,
+                "the node page has layout version 2, which says nothing of keys, and this build reads version {VERSION}: write it again with `snakectl flash`"
             ),
             Self::Version { found } => write!(
                 f,
@@ -308,7 +320,9 @@ impl NodePage {
         };
         let calibration = Calibration { joints, imu_mounting, motors: [motor(0)?, motor(1)?] };
         let safety = Safety { joints: ranges, caps, supply, dead_man_ms, blind_relaxes };
-        let page = NodePage { node: byte(NODE_AT)?, modules: byte(MODULES_AT)?, bus_off, safety, calibration };
+        let key = |at: usize| bytes.get(at..).and_then(|rest| rest.first_chunk()).copied().ok_or(short);
+        let keys = [key(KEYS_AT)?, key(KEYS_AT + KEY_SIZE)?];
+        let page = NodePage { node: byte(NODE_AT)?, modules: byte(MODULES_AT)?, bus_off, safety, calibration, keys };
         page.check()?;
         Ok(page)
     }
@@ -351,6 +365,7 @@ impl NodePage {
                 put(MOTORS_AT + MOTOR_SIZE * m + 4 * i, &value.to_le_bytes());
             }
         }
+        put(KEYS_AT, self.keys.as_flattened());
         if let Some((body, crc)) = bytes.split_last_chunk_mut::<4>() {
             *crc = CRC.checksum(body).to_le_bytes();
         }
@@ -438,6 +453,7 @@ fn is_rotation(rows: &[[f32; 3]; 3]) -> bool {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
+    use composer_shared::update::NO_KEY;
     use proptest::prelude::*;
     use std::string::ToString;
     use std::vec::Vec;
@@ -462,6 +478,7 @@ pub(crate) mod tests {
                 imu_mounting: [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
                 motors: [motor, MotorCalibration { torque_constant: -79.0, ..motor }],
             },
+            keys: [NO_KEY; 2],
         }
     }
 
@@ -473,8 +490,9 @@ pub(crate) mod tests {
 
     #[test]
     fn the_bytes_are_those_of_the_table() {
-        let bytes = page().encode().unwrap();
-        assert_eq!(bytes[..16], *b"COMPNODE\x02\0\x03\x08\x01\x01\x34\x12");
+        let keys = [[0xa5; KEY_SIZE], core::array::from_fn(|i| i as u8)];
+        let bytes = NodePage { keys, ..page() }.encode().unwrap();
+        assert_eq!(bytes[..16], *b"COMPNODE\x03\0\x03\x08\x01\x01\x34\x12");
         assert_eq!(bytes[40..44], [0x34, 0x12, 1, 0]);
         assert_eq!(bytes[44..48], (-2.2f32).to_le_bytes());
         assert_eq!(bytes[60..64], 1.5f32.to_le_bytes());
@@ -490,7 +508,8 @@ pub(crate) mod tests {
         assert_eq!(bytes[176..180], [0; 4]);
         // The same checksum as the policy image's: of "123456789" it is 0xcbf43926.
         assert_eq!(CRC.checksum(b"123456789"), 0xcbf4_3926);
-        assert_eq!(bytes[180..], CRC.checksum(&bytes[..180]).to_le_bytes());
+        assert_eq!((&bytes[180..212], &bytes[212..214], bytes[243]), (&[0xa5; 32][..], &[0, 1][..], 31));
+        assert_eq!(bytes[244..], CRC.checksum(&bytes[..244]).to_le_bytes());
     }
 
     #[test]
@@ -507,8 +526,8 @@ pub(crate) mod tests {
         assert_eq!(NodePage::parse(&good[..SIZE - 1]), Err(NodePageError::TooShort { length: SIZE - 1 }));
         assert_eq!(NodePage::parse(&[0; SIZE]), Err(NodePageError::Magic));
         let mut bytes = good;
-        bytes[8] = 3;
-        assert_eq!(NodePage::parse(&bytes), Err(NodePageError::Version { found: 3 }));
+        bytes[8] = 4;
+        assert_eq!(NodePage::parse(&bytes), Err(NodePageError::Version { found: 4 }));
         let mut bytes = good;
         bytes[70] ^= 4;
         assert!(matches!(NodePage::parse(&bytes), Err(NodePageError::Checksum { .. })));
@@ -583,7 +602,7 @@ pub(crate) mod tests {
         assert_eq!(error, NodePageError::Version { found: 1 });
         assert_eq!(
             error.to_string(),
-            "the node page has layout version 1, which says nothing of limits, and this build reads version 2: write it again with `snakectl flash`"
+            "the node page has layout version 1, which says nothing of limits, and this build reads version 3: write it again with `snakectl flash`"
         );
         // It was 128 bytes long.
         assert_eq!(NodePage::parse(&bytes[..128]), Err(NodePageError::Version { found: 1 }));

@@ -20,6 +20,12 @@
 //! | 11 LOG | entry, 0 the newest | word | the word, see below | no such entry or word (2) |
 //! | 12 CLEAR_LOG | | | | armed (5), another station (10) |
 //! | 13 RESTART | | | | armed (5), busy (9), another station (10) |
+//! | 14 UPDATE | step: 0 begin | session, bytes | 1 if what was received before is still there | out of range (4), armed (5), storage failed (8), busy (9), another station (10), on trial (20) |
+//! | 14 UPDATE | 1 verify | CRC-32 of the policy | the same | armed (5), busy (9), another station (10), and 11 to 20 |
+//! | 14 UPDATE | 2 commit, 3 confirm | CRC-32 of the policy | the same | armed (5), storage failed (8), busy (9), another station (10), no update (11), on trial (20) |
+//! | 14 UPDATE | 4 abandon | | | armed (5), storage failed (8), busy (9), another station (10), on trial (20) |
+//! | 15 UPDATE_STATUS | item | | the item ([`Updater::item`]) | there is none (2) |
+//! | 16 UPDATE_LOG | record, 0 the newest | | its first four bytes; 0 if it says nothing | no such record (2) |
 //!
 //! HELLO's items: 0 versions of protocol, firmware and node page and number of modules, a byte each from bit 0 on; 1 to 3 the words of
 //! the unique identifier; 4 the CRC-32 of the policy image; 5 reset reason (bits 0 to 7), resets in a row (8 to 15), starts (16 to 31).
@@ -27,12 +33,17 @@
 //! # Only while disarmed
 //!
 //! What moves or forgets anything is refused while the module is armed: WRITE to a field of the node page, STORE, SET_NODE, JOG, CLEAR, CLEAR_LOG,
-//! RESTART.
+//! RESTART, UPDATE. A module whose policy is on trial is not armed (code 20).
 //!
 //! # Node page
 //!
 //! WRITE changes a copy of the page; STORE checks it as a whole and keeps it ([`crate::storage`]); it counts from the next start on. Its
-//! answer comes when the page lies in the flash, some 50 ms later.
+//! answer comes when the page lies in the flash, some 50 ms later. A module with a key takes no WRITE to its node page but that of its number (code 21): limits and keys are
+//! as much the key holder's as the policy.
+//!
+//! # Update
+//!
+//! [`crate::update`]. A policy that is on trial is given up, and the module restarts, if nobody confirms it in [`TRIAL_CYCLES`] control cycles, or twice their time.
 //!
 //! # A number for a module
 //!
@@ -49,7 +60,7 @@
 //!
 //! The station has one identifier, so two of them cannot be told apart by it, but by their sequence numbers: each counts its own, one a request, from any number on. A
 //! station is at work if it has been changing things for at least [`AT_WORK_US`], the last one less than [`STATION_US`] ago. Then a request that changes something is
-//! refused (code 10) if its sequence number is more than [`SEQUENCE_NEAR`] away. HELLO, READ, LOG, IDENTIFY and DISARM change nothing and are never refused for that.
+//! refused (code 10) if its sequence number is more than [`SEQUENCE_NEAR`] away. HELLO, READ, LOG, IDENTIFY, DISARM, UPDATE_STATUS and UPDATE_LOG change nothing and are never refused for that.
 //!
 //! # Fault log
 //!
@@ -69,8 +80,9 @@
 use composer_shared::observation::Sensors;
 use composer_shared::registers::{Access, Register};
 use composer_shared::robot::{AXES, MAX_JOINTS};
+use composer_shared::update::Key;
 use composer_shared::wire::{
-    Fault, Frame, Function, Message, Mode, NOBODY, Operation, PROTOCOL_VERSION, ServiceCode, ServiceRequest,
+    Fault, Frame, Function, Heartbeat, Message, Mode, NOBODY, Operation, PROTOCOL_VERSION, ServiceCode, ServiceRequest,
     ServiceResponse,
 };
 use embedded_storage::nor_flash::NorFlash;
@@ -81,6 +93,7 @@ use crate::failsafe::{BusOffPolicy, FaultSet};
 use crate::node_page::{self, NodePage, NodePageError};
 use crate::port::PortStatus;
 use crate::storage::{Entry, FaultLog, Save, is_doubled};
+use crate::update::{PolicyFlash, TRIAL_CYCLES, Updater};
 
 /// The longest jog.
 pub const JOG_MAX_MS: u16 = 2_000;
@@ -140,6 +153,12 @@ pub trait Board {
     /// Where node page and fault log lie.
     fn storage(&mut self) -> &mut Self::Flash;
 
+    /// Where policies lie, see [`crate::update`].
+    type Policies: PolicyFlash;
+
+    /// Where policies lie.
+    fn policies(&mut self) -> &mut Self::Policies;
+
     /// The chip's unique identifier.
     fn unique_id(&self) -> [u32; 3];
 
@@ -197,11 +216,18 @@ pub struct Service {
     /// When a fault of each number was last logged, ms.
     logged: [Option<u32>; Fault::ALL.len()],
     storage_errors: u32,
+    updater: Updater,
 }
 
 impl Service {
-    /// The service of a module that starts at `now` with this node page.
-    pub fn new(page: NodePage, controller: &mut Controller<'_>, now: Micros, board: &mut impl Board) -> Self {
+    /// The service of a module that starts at `now` with this node page and the policy that `updater` says.
+    pub fn new(
+        page: NodePage,
+        updater: Updater,
+        controller: &mut Controller<'_>,
+        now: Micros,
+        board: &mut impl Board,
+    ) -> Self {
         controller.leave_requests();
         let log = FaultLog::open(board.storage());
         let mut service = Service {
@@ -226,7 +252,9 @@ impl Service {
             faults: FaultSet::EMPTY,
             logged: [None; Fault::ALL.len()],
             storage_errors: 0,
+            updater,
         };
+        controller.set_remark(service.remark());
         let boot = controller.boot();
         service.log.push(0, 0, u16::from(boot.reason()) | u16::from(boot.resets_in_a_row()) << 8);
         if !is_doubled(board.storage()) {
@@ -248,12 +276,57 @@ impl Service {
     ) {
         self.watch(now, controller, board);
         self.hear(now, received);
-        if let Some(frame) = received.filter(|frame| frame.function() == Some(Function::ServiceRequest))
-            && let Ok(Message::ServiceRequest(request)) = Message::parse(frame)
-        {
-            self.receive(now, &request, controller, sensors, board);
+        if let Some(frame) = received {
+            self.take(now, frame, controller, sensors, board);
         }
+        self.watch_trial(now, controller);
         self.work(controller, board);
+    }
+
+    fn take(
+        &mut self,
+        now: Micros,
+        frame: &Frame,
+        controller: &mut Controller<'_>,
+        sensors: &Sensors,
+        board: &mut impl Board,
+    ) {
+        match frame.function() {
+            Some(Function::ServiceRequest) => {
+                if let Ok(Message::ServiceRequest(request)) = Message::parse(frame) {
+                    self.receive(now, &request, controller, sensors, board);
+                }
+            }
+            Some(Function::UpdateChunk | Function::UpdatePiece) if !controller.armed() => match Message::parse(frame) {
+                Ok(Message::UpdateChunk(chunk)) => self.updater.hear_chunk(&chunk),
+                Ok(Message::UpdatePiece(piece)) => self.updater.hear_piece(&piece),
+                _ => {}
+            },
+            _ => {}
+        }
+    }
+
+    /// Ends a trial that takes too long.
+    fn watch_trial(&mut self, now: Micros, controller: &Controller<'_>) {
+        if self.updater.given_up() && self.restart_at.is_none() {
+            self.restart_at = Some(now.saturating_add(RESTART_US));
+        } else if self.updater.on_trial() {
+            let time = 2 * u64::from(TRIAL_CYCLES) * u64::from(controller.config().timing.period_us);
+            if controller.stats().cycles >= TRIAL_CYCLES || now.saturating_sub(self.started) >= time {
+                self.updater.give_up();
+            }
+        }
+    }
+
+    /// What HEARTBEAT says of the policy.
+    fn remark(&self) -> u8 {
+        let lab = if self.updater.lab() { Heartbeat::LAB } else { 0 };
+        lab | if self.updater.on_trial() { Heartbeat::TRIAL } else { 0 }
+    }
+
+    /// Its policies.
+    pub fn updater(&self) -> &Updater {
+        &self.updater
     }
 
     /// The next answer to send.
@@ -273,7 +346,7 @@ impl Service {
 
     /// Whether something is on its way into the flash. It goes on with every poll, or with [`Service::work`].
     pub fn is_busy(&self) -> bool {
-        self.saving.is_some() || self.log.is_busy()
+        self.saving.is_some() || self.log.is_busy() || self.updater.is_busy()
     }
 
     /// When to poll again at the latest.
@@ -324,11 +397,21 @@ impl Service {
     }
 
     /// Does one thing with the flash, if there is something to do.
-    pub fn work(&mut self, controller: &Controller<'_>, board: &mut impl Board) {
-        if self.saving.is_none() && self.log.is_idle() {
+    pub fn work(&mut self, controller: &mut Controller<'_>, board: &mut impl Board) {
+        let updating = self.updater.is_busy();
+        if self.saving.is_none() && self.log.is_idle() && !updating {
             return;
         }
         let may_erase = !controller.armed() && controller.mode() != Mode::Service;
+        if updating && may_erase && self.saving.is_none() {
+            if let Some((request, result)) = self.updater.work(board.policies()) {
+                self.answer(match result {
+                    Ok(value) => request.answer(ServiceCode::Ok, value),
+                    Err(code) => request.answer(code, 0),
+                });
+            }
+            return controller.set_remark(self.remark());
+        }
         let Some((save, job)) = self.saving.as_mut().filter(|_| may_erase) else {
             return self.log.work(board.storage(), may_erase);
         };
@@ -421,6 +504,7 @@ impl Service {
         match operation {
             Operation::Hello => self.hello(index, controller, board).map(Some),
             Operation::Arm if value > 1 => Err(ServiceCode::OutOfRange),
+            Operation::Arm if self.updater.on_trial() => Err(ServiceCode::OnTrial),
             Operation::Arm => controller.arm(value == 1).map(|()| Some(0)),
             Operation::Disarm => {
                 controller.disarm();
@@ -471,12 +555,30 @@ impl Service {
                 self.restart_at = Some(now.saturating_add(RESTART_US));
                 Ok(Some(0))
             }
+            Operation::Update => {
+                disarmed?;
+                self.free()?;
+                at_rest(controller)?;
+                self.updater.serve(request, controller.policy().crc())
+            }
+            Operation::UpdateStatus if index == 23 => Ok(Some(controller.policy().task() as u32)),
+            Operation::UpdateStatus => self.updater.item(index).map(Some).ok_or(ServiceCode::NoSuchRegister),
+            Operation::UpdateLog => {
+                if u32::from(index) >= self.updater.records().count() {
+                    return Err(ServiceCode::NoSuchRegister);
+                }
+                let record = self.updater.records().back(board.policies(), index.into());
+                Ok(Some(record.map_or(0, |record| {
+                    let [a, b, c, d, ..] = record.emit();
+                    u32::from_le_bytes([a, b, c, d])
+                })))
+            }
         }
     }
 
-    /// Whether the flash is free for another page.
+    /// Whether the flash is free for another page, or another step of an update.
     fn free(&self) -> Result<(), ServiceCode> {
-        if self.saving.is_some() { Err(ServiceCode::Busy) } else { Ok(()) }
+        if self.saving.is_some() || self.updater.is_busy() { Err(ServiceCode::Busy) } else { Ok(()) }
     }
 
     fn hello(&self, item: u8, controller: &Controller<'_>, board: &impl Board) -> Result<u32, ServiceCode> {
@@ -577,6 +679,9 @@ impl Service {
             if controller.armed() {
                 return Err(ServiceCode::Armed);
             }
+            if register != Register::Node && !self.updater.lab() {
+                return Err(ServiceCode::Locked);
+            }
             // A page on its way into the flash must not change.
             self.free()?;
         }
@@ -658,7 +763,9 @@ impl Service {
             Register::Trip => trips.reasons().get(usize::from(offset)).copied().flatten().map_or(0, trip_number),
             Register::EncoderErrors => word(&raw.encoder_errors, offset),
             Register::ImuErrors => raw.imu_errors,
-            Register::StorageErrors => self.storage_errors.saturating_add(self.log.errors()),
+            Register::StorageErrors => {
+                self.storage_errors.saturating_add(self.log.errors()).saturating_add(self.updater.errors())
+            }
             Register::LogNewest => self.log.newest(),
             Register::LogLost => self.log.lost(),
             Register::EncoderRaw => {
@@ -682,7 +789,16 @@ impl Service {
 
 /// Whether an operation changes something, and so is one station's at a time.
 fn changes(operation: Operation) -> bool {
-    !matches!(operation, Operation::Hello | Operation::Read | Operation::Log | Operation::Identify | Operation::Disarm)
+    !matches!(
+        operation,
+        Operation::Hello
+            | Operation::Read
+            | Operation::Log
+            | Operation::Identify
+            | Operation::Disarm
+            | Operation::UpdateStatus
+            | Operation::UpdateLog
+    )
 }
 
 fn word(words: &[u32], which: u8) -> u32 {
@@ -749,7 +865,7 @@ fn culprit(error: &NodePageError) -> u8 {
 /// A field of the node page, as bits.
 fn get(page: &NodePage, register: Register, offset: u8) -> u32 {
     let at = usize::from(offset);
-    let NodePage { node, modules, bus_off, safety, calibration } = page;
+    let NodePage { node, modules, bus_off, safety, calibration, keys: [key_a, key_b] } = page;
     let joint = calibration.joints.get(at).copied().unwrap_or_default();
     let range = safety.joints.get(at);
     let motor = calibration.motors.get(at);
@@ -761,6 +877,8 @@ fn get(page: &NodePage, register: Register, offset: u8) -> u32 {
         Register::EncoderZero => return joint.zero.into(),
         Register::EncoderReversed => return joint.reversed.into(),
         Register::DeadMan => return safety.dead_man_ms.into(),
+        Register::KeyA => return word_of(key_a, at),
+        Register::KeyB => return word_of(key_b, at),
         Register::ImuMounting => calibration.imu_mounting.as_flattened().get(at).copied().unwrap_or(f32::NAN),
         Register::TorqueConstant => motor.map_or(f32::NAN, |m| m.torque_constant),
         Register::CurrentLimit => motor.map_or(f32::NAN, |m| m.current_limit),
@@ -782,11 +900,20 @@ fn get(page: &NodePage, register: Register, offset: u8) -> u32 {
     float.to_bits()
 }
 
+/// Word `at` of a key.
+fn word_of(key: &Key, at: usize) -> u32 {
+    key.as_chunks().0.get(at).map_or(0, |bytes| u32::from_le_bytes(*bytes))
+}
+
+fn set_word(key: &mut Key, at: usize, value: u32) {
+    key.as_chunks_mut().0.get_mut(at).into_iter().for_each(|bytes| *bytes = value.to_le_bytes());
+}
+
 /// Writes a field of the node page; the value lies in the register's range.
 fn set(page: &mut NodePage, register: Register, offset: u8, value: u32) {
     let at = usize::from(offset);
     let float = f32::from_bits(value);
-    let NodePage { node, modules, bus_off, safety, calibration } = page;
+    let NodePage { node, modules, bus_off, safety, calibration, keys: [key_a, key_b] } = page;
     let joint = calibration.joints.get_mut(at);
     let range = safety.joints.get_mut(at);
     let motor = calibration.motors.get_mut(at);
@@ -800,6 +927,8 @@ fn set(page: &mut NodePage, register: Register, offset: u8, value: u32) {
         Register::EncoderZero => return joint.into_iter().for_each(|joint| joint.zero = value as u16),
         Register::EncoderReversed => return joint.into_iter().for_each(|joint| joint.reversed = value != 0),
         Register::DeadMan => return safety.dead_man_ms = value as u16,
+        Register::KeyA => return set_word(key_a, at, value),
+        Register::KeyB => return set_word(key_b, at, value),
         Register::ImuMounting => calibration.imu_mounting.as_flattened_mut().get_mut(at),
         Register::TorqueConstant => motor.map(|m| &mut m.torque_constant),
         Register::CurrentLimit => motor.map(|m| &mut m.current_limit),

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail, ensure};
 use composer_firmware::drivers::encoder::JointCalibration;
 use composer_firmware::limits::{Caps, JointRange};
-use composer_firmware::memory_map::{FLASH_ADDRESS, FLASH_SIZE, NODE_PAGE_ADDRESS, POLICY_ADDRESS};
+use composer_firmware::memory_map::{FLASH_ADDRESS, FLASH_SIZE, NODE_PAGE_ADDRESS, POLICY_ADDRESS, RECORDS_ADDRESS};
 use composer_firmware::node_page::{Calibration, MotorCalibration};
 use composer_firmware::safety::Safety;
 use composer_firmware::supply::Thresholds;
@@ -146,8 +146,10 @@ pub fn check_image(path: &Path) -> Result<()> {
 pub struct Plan {
     /// The image, an ELF file.
     pub image: PathBuf,
-    /// The policy image.
+    /// The policy image, with its header if it is signed.
     pub policy: PathBuf,
+    /// The records that make it count.
+    pub records: PathBuf,
     /// The node page.
     pub node_page: PathBuf,
     /// The chip as probe-rs calls it.
@@ -176,6 +178,7 @@ impl Plan {
         let reset = ["reset", "--non-interactive"].map(OsString::from).into_iter().chain(self.target()).collect();
         vec![
             ("write the policy", download(at(POLICY_ADDRESS).collect(), &self.policy)),
+            ("write the records of policies", download(at(RECORDS_ADDRESS).collect(), &self.records)),
             ("write the node page", download(at(NODE_PAGE_ADDRESS).collect(), &self.node_page)),
             ("write the image", download(elf, &self.image)),
             ("restart the module", reset),
@@ -193,12 +196,14 @@ mod tests {
     use super::*;
     use composer_firmware::failsafe::BusOffPolicy;
     use composer_firmware::node_page::NodePage;
+    use composer_shared::update::NO_KEY;
 
     #[test]
     fn the_nominal_calibration_fits_the_robot_that_ships() {
         let robot = Robot::default();
         let (calibration, safety) = calibration(NOMINAL_CALIBRATION, &robot).unwrap();
-        let page = NodePage { node: 0, modules: 8, bus_off: BusOffPolicy::Recover, safety, calibration };
+        let page =
+            NodePage { node: 0, modules: 8, bus_off: BusOffPolicy::Recover, safety, calibration, keys: [NO_KEY; 2] };
         assert_eq!(NodePage::parse(&page.encode().unwrap()), Ok(page));
         // One definition: the file says in SI units what the firmware says in those of the robot.
         assert_eq!((calibration, safety), (Calibration::NOMINAL, Safety::BOARD));

@@ -26,6 +26,7 @@ pub mod run;
 pub mod run_folder;
 pub mod scenario;
 pub mod side_by_side;
+pub mod signing;
 pub mod sil;
 pub mod sim;
 pub mod stats;

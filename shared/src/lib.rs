@@ -16,5 +16,6 @@ pub mod policies;
 pub mod policy;
 pub mod registers;
 pub mod robot;
+pub mod sha512;
 pub mod update;
 pub mod wire;

@@ -321,6 +321,10 @@ registers! {
     176 SupplyOver "supply_over" F32 WhileDisarmed 7.2 .. 60, 1, "V";
     /// So long without a frame of the station, and the module relaxes and disarms: 0 never, or at least 0.2 s.
     177 DeadMan "dead_man" U32 WhileDisarmed 0 .. 60000, 0.001, "s";
+    /// Ed25519 public key of who may change the policy, word by word; all 0: none. With a key the page cannot be changed over the bus (code 21), but for `node`.
+    178 KeyA[8] "key_a" U32 WhileDisarmed 0 .. u32::MAX, 1, "";
+    /// The same, a second key for the time in which keys are changed.
+    186 KeyB[8] "key_b" U32 WhileDisarmed 0 .. u32::MAX, 1, "";
 }
 
 impl Register {

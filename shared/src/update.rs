@@ -58,7 +58,7 @@ const CRC_AT: usize = 28;
 const DIGEST_AT: usize = 32;
 const KEY_AT: usize = DIGEST_AT + DIGEST_SIZE;
 const _: () = assert!(KEY_AT + KEY_ID_SIZE == SIGNED && SIGNED + SIGNATURE_SIZE == HEADER_SIZE);
-const _: () = assert!(HEADER_SIZE % CHUNK_SIZE == 0 && CHUNKS_MAX * CHUNK_SIZE == SLOT_SIZE);
+const _: () = assert!(HEADER_SIZE.is_multiple_of(CHUNK_SIZE) && CHUNKS_MAX * CHUNK_SIZE == SLOT_SIZE);
 
 /// Why bytes are no header that this firmware understands.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -9,6 +9,8 @@ use composer_shared::policy::Policy;
 use composer_shared::robot::MAX_MODULES;
 use composer_shared::wire::{Frame, Mode};
 
+use crate::policy_flash::Policies;
+
 /// Why a computer does not answer.
 #[derive(Debug, thiserror::Error)]
 pub enum Trouble {
@@ -135,7 +137,7 @@ impl<'a> Launcher for InProcess<'a> {
     type Computer = Local<'a>;
 
     fn start(&self, config: Config, boot: Boot, now: Micros) -> Result<Local<'a>, Trouble> {
-        let mut module = Emulated::new(self.policy);
+        let mut module = Emulated::new(self.policy, Policies::default());
         let mounted = self.mounted.get(usize::from(config.node)).copied().unwrap_or(Calibration::NOMINAL);
         module.start(config, boot, now, mounted).map_err(Trouble::Config)?;
         let outputs = Outputs { torque: Default::default(), motors_enabled: false, deadline: now };
@@ -146,13 +148,13 @@ impl<'a> Launcher for InProcess<'a> {
 /// A module in this process.
 #[derive(Debug)]
 pub struct Local<'a> {
-    module: Emulated<'a>,
+    module: Emulated<'a, Policies>,
     outputs: Outputs,
 }
 
 impl<'a> Local<'a> {
     /// The module.
-    pub fn module(&mut self) -> &mut Emulated<'a> {
+    pub fn module(&mut self) -> &mut Emulated<'a, Policies> {
         &mut self.module
     }
 }

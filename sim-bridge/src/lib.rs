@@ -46,6 +46,7 @@ pub mod frame_bits;
 pub mod live;
 pub mod pcap;
 pub mod plant;
+pub mod policy_flash;
 pub mod port;
 pub mod qemu;
 pub mod remote;

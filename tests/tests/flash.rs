@@ -7,13 +7,14 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::Output;
 
-use common::{arm_image, command, refuse};
+use common::{arm_image, command, refuse, succeed};
 use composer_firmware::failsafe::BusOffPolicy;
 use composer_firmware::limits::{Caps, JointRange};
-use composer_firmware::memory_map::{FLASH_ADDRESS, NODE_PAGE_ADDRESS, POLICY_ADDRESS};
+use composer_firmware::memory_map::{FLASH_ADDRESS, NODE_PAGE_ADDRESS, POLICY_ADDRESS, RECORDS_ADDRESS};
 use composer_firmware::node_page::NodePage;
 use composer_firmware::safety::Safety;
 use composer_firmware::supply::Thresholds;
+use composer_firmware::update::records::of_new_module;
 use composer_shared::policies;
 
 /// Keeps its arguments, one call a line, and a copy of each file it is to write. `list` prints the file `probes`; the call whose arguments
@@ -91,9 +92,9 @@ fn image_policy_and_node_page_come_to_their_places() {
     assert!(String::from_utf8_lossy(&output.stderr).contains("nominal values"));
 
     let calls = bench.calls();
-    let [list, policy, page, firmware, reset] = &calls[..] else { panic!("{calls:#?}") };
+    let [list, policy, records, page, firmware, reset] = &calls[..] else { panic!("{calls:#?}") };
     assert_eq!(list, "list");
-    for (call, address) in [(policy, POLICY_ADDRESS), (page, NODE_PAGE_ADDRESS)] {
+    for (call, address) in [(policy, POLICY_ADDRESS), (records, RECORDS_ADDRESS), (page, NODE_PAGE_ADDRESS)] {
         assert!(call.starts_with("download ") && call.contains(" --verify "), "{call}");
         assert!(call.contains(&format!(" --binary-format bin --base-address {address:#010x} ")), "{call}");
     }
@@ -102,8 +103,10 @@ fn image_policy_and_node_page_come_to_their_places() {
     assert!(calls[1..].iter().all(|call| call.contains(" --chip STM32G474RETx --probe 0483:374e")), "{calls:#?}");
 
     assert_eq!(bench.read("tools/policy.bin.written"), policies::shipped("goal-reaching").unwrap());
+    assert_eq!(bench.read("tools/records.bin.written"), of_new_module(0));
     let page = NodePage::parse(&bench.read("tools/node-page.bin.written")).unwrap();
     assert_eq!((page.node, page.modules, page.bus_off), (3, 8, BusOffPolicy::Latch));
+    assert_eq!(page.keys, [[0; 32]; 2]);
     // 0.2 N m per A, and a torque unit is 0.0025 N m.
     assert_eq!(page.calibration.motors[0].torque_constant, 80.0);
     assert_eq!(bench.read("tools/module.elf.written"), bench.read("module.elf"));
@@ -242,4 +245,23 @@ fn what_cannot_be_a_module_is_refused_before_anything_is_written() {
     refuse(bench.path(), &["flash", "--dry-run", "--node", "0"], &["there is no image", "cargo image-stm32g474"]);
     refuse(bench.path(), &["flash", "--node", "0", "--image", "module.elf", "--out", "x"], &["--dry-run"]);
     assert!(!bench.path().join("module").exists(), "nothing was written");
+}
+
+#[test]
+fn a_key_and_a_signed_policy_come_to_their_places() {
+    let bench = Bench::new();
+    succeed(bench.path(), &["key", "new", "lab"]);
+    succeed(bench.path(), &["sign", "tube-crossing", "--key", "lab", "--counter", "9", "-o", "tube.signed"]);
+    let output = bench.flash(&["--policy", "tube.signed", "--key", "lab.pub"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert_eq!(bench.read("tools/policy.bin.written"), bench.read("tube.signed"));
+    assert_eq!(bench.read("tools/records.bin.written"), of_new_module(9));
+    let page = NodePage::parse(&bench.read("tools/node-page.bin.written")).unwrap();
+    let digits: String = page.keys[0].iter().map(|byte| format!("{byte:02x}")).collect();
+    assert!(String::from_utf8(bench.read("lab.pub")).unwrap().contains(&digits));
+    assert_eq!(page.keys[1], [0; 32]);
+    let complaint = bench.complaint(&bench.flash(&["--key", "lab"]));
+    assert!(complaint.contains("lab is a secret key") && complaint.contains("lab.pub"), "{complaint}");
+    let complaint = bench.complaint(&bench.flash(&["--key", "lab.pub", "--key", "lab.pub", "--key", "lab.pub"]));
+    assert!(complaint.contains("room for two keys"), "{complaint}");
 }

@@ -245,7 +245,7 @@ fn a_configuration_is_dumped_and_restored_and_that_of_another_robot_is_refused()
 fn emulated_microcontrollers_answer_as_modules_in_this_process_do() {
     let live = Live::start(&["--no-station", "--qemu", "--modules", "3"]);
     let text = live.bus(&["node", "1", "hello"]);
-    assert!(text.contains("protocol: 2") && text.contains("modules: 3"), "{text}");
+    assert!(text.contains("protocol: 3") && text.contains("modules: 3"), "{text}");
     assert_eq!(live.bus(&["node", "1", "set", "encoder_zero_0", "9"]).trim(), "encoder_zero_0 = 9 (0.0035 rad)");
     live.bus(&["node", "1", "store"]);
     live.bus(&["node", "1", "restart"]);

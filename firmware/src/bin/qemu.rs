@@ -5,20 +5,27 @@
 use core::panic::PanicInfo;
 use core::slice;
 
+use composer_firmware::emulated::Lasting;
 use composer_firmware::link::{FromModule, MESSAGE_MAX, Receiver, Text, decode, encode, module};
-use composer_shared::policy::{IMAGE_SIZE, Policy};
+use composer_firmware::update::{PolicyFlash, SECTION, SIZE, image_in, slot_at};
+use composer_shared::policy::Policy;
+use composer_shared::update::{SLOT_SIZE, Slot};
 use cortex_m::peripheral::syst::SystClkSource;
 use cortex_m_rt::{ExceptionFrame, entry, exception};
 use cortex_m_semihosting::debug;
+use embedded_storage::nor_flash::{
+    ErrorType, NorFlash, NorFlashErrorKind, ReadNorFlash, check_erase, check_read, check_write,
+};
 use uart::Uart;
 
 #[entry]
 fn main() -> ! {
     let mut uart = Uart::new();
-    let policy = Policy::parse(policy_image());
+    let mut flash = Flash;
+    let policy = Policy::parse(flash.lasting(Slot::A).unwrap_or_default());
     send(&module::hello(policy.as_ref().ok()));
     let mut module = match policy {
-        Ok(policy) => module::Module::new(policy),
+        Ok(policy) => module::Module::new(policy, flash),
         Err(error) => {
             send(&FromModule::Refused(Text::of(error).as_str()));
             loop {
@@ -34,16 +41,83 @@ fn main() -> ! {
     }
 }
 
-/// The policy's region of the flash, as far as an image reaches.
-fn policy_image() -> &'static [u8] {
-    unsafe extern "C" {
-        /// From `boards/qemu.x`: addresses, not variables.
-        static _policy_start: u8;
-        static _policy_size: u8;
+/// The flash of the policies. This machine's is RAM, so it is emulated: words are written where it is erased, once.
+#[derive(Debug)]
+struct Flash;
+
+impl Flash {
+    /// Where it begins.
+    fn start() -> *mut u8 {
+        unsafe extern "C" {
+            /// From `boards/qemu.x`: an address, not a variable.
+            static mut _policy_start: u8;
+        }
+        &raw mut _policy_start
     }
-    // SAFETY: the linker script reserves these bytes of flash for the image; nobody writes them while the module runs.
-    let region = unsafe { slice::from_raw_parts(&raw const _policy_start, &raw const _policy_size as usize) };
-    region.get(..IMAGE_SIZE).unwrap_or(region)
+
+    /// Bytes that lie in it.
+    fn slice<'a>(from: u32, length: usize) -> Option<&'a [u8]> {
+        let end = (from as usize).checked_add(length)?;
+        // SAFETY: the linker script reserves these bytes, and nobody writes what a controller runs with: `Updater` writes the other slot.
+        (end <= SIZE as usize).then(|| unsafe { slice::from_raw_parts(Flash::start().add(from as usize), length) })
+    }
+
+    fn put(at: u32, byte: u8) {
+        // SAFETY: callers have checked that it lies in the region, which nothing else writes; there is one core and no interrupt handler.
+        unsafe { Flash::start().add(at as usize).write_volatile(byte) }
+    }
+}
+
+impl Lasting<'static> for Flash {
+    fn lasting(&mut self, slot: Slot) -> Option<&'static [u8]> {
+        image_in(Flash::slice(slot_at(slot), SLOT_SIZE)?)
+    }
+}
+
+impl PolicyFlash for Flash {
+    fn bytes(&self, from: u32, length: usize) -> Option<&[u8]> {
+        Flash::slice(from, length)
+    }
+}
+
+impl ErrorType for Flash {
+    type Error = NorFlashErrorKind;
+}
+
+impl ReadNorFlash for Flash {
+    const READ_SIZE: usize = 1;
+
+    fn read(&mut self, offset: u32, bytes: &mut [u8]) -> Result<(), NorFlashErrorKind> {
+        check_read(self, offset, bytes.len())?;
+        let from = Flash::slice(offset, bytes.len()).ok_or(NorFlashErrorKind::OutOfBounds)?;
+        bytes.iter_mut().zip(from).for_each(|(to, from)| *to = *from);
+        Ok(())
+    }
+
+    fn capacity(&self) -> usize {
+        SIZE as usize
+    }
+}
+
+impl NorFlash for Flash {
+    const WRITE_SIZE: usize = 8;
+    const ERASE_SIZE: usize = SECTION as usize;
+
+    fn erase(&mut self, from: u32, to: u32) -> Result<(), NorFlashErrorKind> {
+        check_erase(self, from, to)?;
+        (from..to).for_each(|at| Flash::put(at, 0xff));
+        Ok(())
+    }
+
+    fn write(&mut self, offset: u32, bytes: &[u8]) -> Result<(), NorFlashErrorKind> {
+        check_write(self, offset, bytes.len())?;
+        let there = Flash::slice(offset, bytes.len()).ok_or(NorFlashErrorKind::OutOfBounds)?;
+        if there.iter().any(|byte| *byte != 0xff) {
+            return Err(NorFlashErrorKind::Other);
+        }
+        (offset..).zip(bytes).for_each(|(at, byte)| Flash::put(at, *byte));
+        Ok(())
+    }
 }
 
 fn send(message: &FromModule<'_>) {

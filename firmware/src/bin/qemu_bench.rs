@@ -20,6 +20,7 @@ use composer_firmware::safety::Safety;
 use composer_firmware::service::{Board, Raw, Service};
 use composer_firmware::storage::RamFlash;
 use composer_firmware::supply::Extremes;
+use composer_firmware::update::{NoPolicies, Updater, verify};
 use composer_shared::kinematics::Chain;
 use composer_shared::nn::Dense;
 use composer_shared::observation::{Motors, Seeker, Sensors, Told, observe};
@@ -27,6 +28,8 @@ use composer_shared::policies;
 use composer_shared::policy::{Latent, Memory, Policy};
 use composer_shared::registers::Register;
 use composer_shared::robot::{Geometry, MAX_MODULES};
+use composer_shared::sha512::Sha512;
+use composer_shared::update::{Key, NO_KEY};
 use composer_shared::wire::{
     Frame, Goal, Health, LatentMessage, Message, Operation, STATION, ServiceRequest, State, Sync,
 };
@@ -189,10 +192,15 @@ fn latent_message(policy: &Policy<'_>, cycle: u8, latent: Latent) -> LatentMessa
 }
 
 /// What a service needs of a board.
-struct Bench(RamFlash<1024>);
+struct Bench(RamFlash<1024>, NoPolicies);
 
 impl Board for Bench {
     type Flash = RamFlash<1024>;
+    type Policies = NoPolicies;
+
+    fn policies(&mut self) -> &mut NoPolicies {
+        &mut self.1
+    }
 
     fn storage(&mut self) -> &mut Self::Flash {
         &mut self.0
@@ -219,12 +227,14 @@ fn service(policy: Policy<'_>, random: &mut Random) {
         bus_off: BusOffPolicy::Recover,
         safety: Safety::BOARD,
         calibration: Calibration::NOMINAL,
+        keys: [NO_KEY; 2],
     };
-    let mut board = Bench(RamFlash::ERASED);
-    let mut service = Service::new(page, &mut controller, 0, &mut board);
+    let mut board = Bench(RamFlash::ERASED, NoPolicies);
+    let updater = Updater::start(board.policies(), page.keys, |_, _| false);
+    let mut service = Service::new(page, updater, &mut controller, 0, &mut board);
     let sensors = sensors(random);
     while service.is_busy() {
-        service.work(&controller, &mut board);
+        service.work(&mut controller, &mut board);
     }
     let index = Register::DeadMan.spec().first;
     let request = ServiceRequest { destination: 3, operation: Operation::Read as u8, sequence: 0, index, value: 0 };
@@ -241,6 +251,36 @@ fn service(policy: Policy<'_>, random: &mut Random) {
         });
         report(format_args!("service/{name}"), instructions);
     }
+}
+
+/// RFC 8032, 7.1, test 3.
+const KEY: Key = [
+    0xfc, 0x51, 0xcd, 0x8e, 0x62, 0x18, 0xa1, 0xa3, 0x8d, 0xa4, 0x7e, 0xd0, 0x02, 0x30, 0xf0, 0x58, 0x08, 0x16, 0xed,
+    0x13, 0xba, 0x33, 0x03, 0xac, 0x5d, 0xeb, 0x91, 0x15, 0x48, 0x90, 0x80, 0x25,
+];
+const SIGNED: [u8; 2] = [0xaf, 0x82];
+const SIGNATURE: [u8; 64] = [
+    0x62, 0x91, 0xd6, 0x57, 0xde, 0xec, 0x24, 0x02, 0x48, 0x27, 0xe6, 0x9c, 0x3a, 0xbe, 0x01, 0xa3, 0x0c, 0xe5, 0x48,
+    0xa2, 0x84, 0x74, 0x3a, 0x44, 0x5e, 0x36, 0x80, 0xd7, 0xdb, 0x5a, 0xc3, 0xac, 0x18, 0xff, 0x9b, 0x53, 0x8d, 0x16,
+    0xf2, 0x90, 0xae, 0x67, 0xf7, 0x60, 0x98, 0x4d, 0xc6, 0x59, 0x4a, 0x7c, 0x15, 0xe9, 0x71, 0x6e, 0xd2, 0x8d, 0xc0,
+    0x27, 0xbe, 0xce, 0xea, 0x1e, 0xc4, 0x0a,
+];
+
+/// What a new policy costs: its signature, and its digest by the kilobyte.
+fn update() {
+    let mut good = false;
+    let signature = ticks(|| good = verify(black_box(&KEY), black_box(&SIGNED), black_box(&SIGNATURE)));
+    if !good {
+        return hprintln!("a good signature was refused");
+    }
+    report(format_args!("update/signature"), signature * TICK);
+    let mut sha = Sha512::new();
+    let kilobyte = [0x5a; 1024];
+    report(
+        format_args!("update/kilobyte"),
+        ticks(|| (0..16).for_each(|_| sha.update(black_box(&kilobyte)))) * TICK / 16,
+    );
+    black_box(sha.finalize());
 }
 
 /// Whole control steps of the last module among `modules`, fed with the frames of all others and of the station.
@@ -318,6 +358,7 @@ fn main() -> ! {
         Some(Ok(policy)) => {
             parts(&policy, &mut random);
             service(policy, &mut random);
+            update();
             for modules in [8, 16, 32, 64] {
                 control_steps(policy, modules, &mut random);
             }

@@ -6,7 +6,7 @@ use composer_shared::robot::AXES;
 
 use super::{BUILD, Carried, FromModule, LinkError, PROTOCOL, Sample, Status, Text, ToModule, Weights};
 use crate::controller::{Controller, FIRMWARE_VERSION};
-use crate::emulated::Emulated;
+use crate::emulated::{Emulated, Lasting};
 use crate::node_page::Calibration;
 use crate::torque_off::Interrupt;
 
@@ -17,17 +17,17 @@ pub fn hello(policy: Option<&Policy<'_>>) -> FromModule<'static> {
 
 /// A module at the end of a link.
 #[derive(Clone, Debug)]
-pub struct Module<'a> {
-    module: Emulated<'a>,
+pub struct Module<'a, F> {
+    module: Emulated<'a, F>,
     sensors: Sensors,
     /// The torque that the simulator knows, by its bits.
     torque: [u32; AXES],
 }
 
-impl<'a> Module<'a> {
-    /// A module with this policy in its flash that has not been started.
-    pub fn new(policy: Policy<'a>) -> Self {
-        Module { module: Emulated::new(policy), sensors: Sensors::ZERO, torque: [0; AXES] }
+impl<'a, F: Lasting<'a>> Module<'a, F> {
+    /// A module that was made with this policy, with its flash for others, that has not been started.
+    pub fn new(policy: Policy<'a>, policies: F) -> Self {
+        Module { module: Emulated::new(policy, policies), sensors: Sensors::ZERO, torque: [0; AXES] }
     }
 
     /// Does what a message says and sends the answer.
@@ -49,8 +49,8 @@ impl<'a> Module<'a> {
     }
 }
 
-fn answer(
-    module: &mut Emulated<'_>,
+fn answer<'a, F: Lasting<'a>>(
+    module: &mut Emulated<'a, F>,
     sensors: &mut Sensors,
     torque: &mut [u32; AXES],
     request: &ToModule,
@@ -107,7 +107,7 @@ fn status(controller: Option<&Controller<'_>>) -> Status {
     }
 }
 
-fn send_frames(module: &mut Emulated<'_>, room: u8, send: &mut impl FnMut(&FromModule<'_>)) {
+fn send_frames<'a, F: Lasting<'a>>(module: &mut Emulated<'a, F>, room: u8, send: &mut impl FnMut(&FromModule<'_>)) {
     for _ in 0..room {
         let Some(frame) = module.next_frame() else { break };
         send(&FromModule::Frame(Carried(frame)));

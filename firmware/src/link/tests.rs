@@ -9,6 +9,8 @@ use proptest::prelude::*;
 use super::module::{Module, hello};
 use super::*;
 use crate::controller::{BusKind, Controller};
+use crate::update::NoPolicies;
+use composer_shared::wire::Heartbeat;
 
 fn bytes_of(message: &impl Serialize) -> Vec<u8> {
     encode(message, &mut [0; MESSAGE_MAX]).to_vec()
@@ -26,7 +28,7 @@ fn image() -> [u8; IMAGE_SIZE] {
 }
 
 /// What a module answers, as text: messages borrow.
-fn answers(module: &mut Module<'_>, request: Result<ToModule, LinkError>) -> Vec<String> {
+fn answers(module: &mut Module<'_, NoPolicies>, request: Result<ToModule, LinkError>) -> Vec<String> {
     let mut said = vec![];
     module.serve(request, &mut |message| said.push(format!("{message:?}")));
     said
@@ -110,7 +112,7 @@ fn the_first_two_numbers_say_the_version() {
 #[test]
 fn the_linker_script_reserves_the_flash_for_the_policy() {
     let script = include_str!("../../boards/qemu.x");
-    assert!(script.contains(&format!("POLICY (r) : ORIGIN = {POLICY_ADDRESS:#010x}")), "{script}");
+    assert!(script.contains(&format!("POLICY (rw) : ORIGIN = {POLICY_ADDRESS:#010x}")), "{script}");
 }
 
 #[test]
@@ -157,7 +159,7 @@ fn a_module_says_who_it_is_and_what_it_cannot_do() {
     let policy = Policy::parse(&image).unwrap();
     let FromModule::Hello { protocol, build, policy: tag, .. } = hello(Some(&policy)) else { panic!("no hello") };
     assert_eq!((protocol, build, tag), (PROTOCOL, BUILD, Some(policy.tag())));
-    let mut module = Module::new(policy);
+    let mut module = Module::new(policy, NoPolicies);
     for request in [ToModule::Status, ToModule::Frames { room: 3 }] {
         assert_eq!(answers(&mut module, Ok(request)), ["Refused(\"the module has not been started\")"]);
     }
@@ -175,7 +177,7 @@ fn a_module_that_is_started_again_is_a_new_one() {
     let policy = Policy::parse(&image).unwrap();
     let start =
         || Ok(ToModule::Start { config: Config::new(0, 1, BusKind::Fd, &policy), boot: Boot::default(), now: 0 });
-    let mut module = Module::new(policy);
+    let mut module = Module::new(policy, NoPolicies);
     let poll = |now| Ok(ToModule::Poll { now, bus: BusStatus::ErrorActive, room: 16, sensors: None, frame: None });
     assert!(answers(&mut module, start()).is_empty());
     answers(&mut module, poll(200_000));
@@ -211,7 +213,8 @@ proptest! {
         let policy = Policy::parse(&image).unwrap();
         let config = Config::new(2, 4, BusKind::Fd, &policy);
         let mut direct = Controller::new(config, policy, Boot::default(), 0).unwrap();
-        let mut module = Module::new(policy);
+        direct.set_remark(Heartbeat::LAB);
+        let mut module = Module::new(policy, NoPolicies);
         let started = answers(&mut module, Ok(ToModule::Start { config, boot: Boot::default(), now: 0 }));
         prop_assert!(started.is_empty());
         let (mut clock, mut sensors, mut torque) = (0, Sensors::ZERO, [0u32; AXES]);
@@ -240,7 +243,7 @@ proptest! {
         let image = image();
         let policy = Policy::parse(&image).unwrap();
         let config = Config::new(0, 8, BusKind::Fd, &policy);
-        let mut module = Module::new(policy);
+        let mut module = Module::new(policy, NoPolicies);
         let mut receiver = Receiver::default();
         let mut bytes = bytes_of(&ToModule::Start { config, boot: Boot::default(), now: 0 });
         let poll = ToModule::Poll { now: 5, bus: BusStatus::ErrorActive, room: 9, sensors: Some(Sample(Sensors::ZERO)), frame: None };

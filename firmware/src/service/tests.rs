@@ -3,7 +3,8 @@ use std::vec::Vec;
 
 use composer_shared::policy::{IMAGE_SIZE, Policy, random_image};
 use composer_shared::registers::{Kind, Spec};
-use composer_shared::wire::{ALL_MODULES, Health, Mode, STATION, State};
+use composer_shared::update::{ChunkRepr, RecordKind, chunks, session};
+use composer_shared::wire::{ALL_MODULES, Health, Mode, Piece, STATION, State, UpdateStep};
 use proptest::prelude::*;
 
 use super::*;
@@ -13,6 +14,8 @@ use crate::port::Counts;
 use crate::power::Power;
 use crate::storage::tests::Dying;
 use crate::storage::{RamFlash, read_page};
+use crate::update::model::G4;
+use crate::update::tests::{image as update_image, package, test_key};
 
 const MS: u64 = 1000;
 const UNIQUE_ID: [u32; 3] = [0x1111_2222, 0x3333_4444, 0x5555_6666];
@@ -22,11 +25,17 @@ const NODE: u8 = 3;
 /// A board whose readings the test sets, and whose power it may cut.
 struct Bench {
     storage: Dying,
+    policies: G4,
     raw: Raw,
 }
 
 impl Board for Bench {
     type Flash = Dying;
+    type Policies = G4;
+
+    fn policies(&mut self) -> &mut G4 {
+        &mut self.policies
+    }
 
     fn storage(&mut self) -> &mut Dying {
         &mut self.storage
@@ -83,13 +92,26 @@ impl<'a> Module<'a> {
 
     /// Starts with what the flash has, or the test's page if it has none.
     fn with_flash(image: &'a [u8], flash: RamFlash<2048>) -> Self {
-        let mut board = Bench { storage: Dying { flash, left: usize::MAX, noise: 1 }, raw: raw() };
+        Self::with_policies(image, flash, G4::new())
+    }
+
+    /// Starts with a policy that is on trial.
+    fn on_trial(image: &'a [u8], policies: G4) -> Self {
+        let module = Self::with_policies(image, RamFlash::ERASED, policies);
+        assert!(module.service.updater().on_trial());
+        module
+    }
+
+    fn with_policies(image: &'a [u8], flash: RamFlash<2048>, policies: G4) -> Self {
+        let storage = Dying { flash, left: usize::MAX, noise: 1 };
+        let mut board = Bench { storage, policies, raw: raw() };
         let page = read_page(board.storage()).unwrap_or(page());
         let policy = Policy::parse(image).unwrap();
         let settings = Config::new(page.node, page.modules, BusKind::Fd, &policy);
         let config = Config { safety: page.safety, bus_off: page.bus_off, ..settings };
         let mut controller = Controller::new(config, policy, Boot::default(), 0).unwrap();
-        let service = Service::new(page, &mut controller, 0, &mut board);
+        let updater = Updater::start(board.policies(), page.keys, |_, _| true);
+        let service = Service::new(page, updater, &mut controller, 0, &mut board);
         let sensors = Sensors { up: [0.0, 0.0, 1.0], temperature: 25.0, ..Sensors::ZERO };
         let mut module = Module { now: 0, controller, service, board, sensors, sequence: 100 };
         module.run(100 * MS);
@@ -242,8 +264,10 @@ fn while_armed_nothing_is_moved_or_forgotten() {
                 | Operation::SetNode
                 | Operation::Jog
                 | Operation::ClearLog
-                | Operation::Restart,
+                | Operation::Restart
+                | Operation::Update,
             ) => ServiceCode::Armed,
+            Some(Operation::UpdateLog) => ServiceCode::NoSuchRegister,
             Some(_) => ServiceCode::Ok,
         };
         assert_eq!(ServiceCode::from_number(code), Some(expected), "operation {operation}");
@@ -796,4 +820,112 @@ proptest! {
             prop_assert!(Mode::from_number(module.controller.mode() as u8).is_some());
         }
     }
+}
+
+/// Frames of an update, as a station sends them.
+fn send_policy(module: &mut Module<'_>, package: &[u8], classic: bool) -> Result<u32, ServiceCode> {
+    let session = session(package);
+    module.step(UpdateStep::Begin, u32::from(session) | (package.len() as u32) << 16)?;
+    for number in 0..chunks(package.len()) as u16 {
+        let chunk = ChunkRepr::of(package, session, number).unwrap();
+        let messages: Vec<Message> = match classic {
+            false => vec![Message::UpdateChunk(chunk)],
+            true => chunk.pieces().map(|piece| Message::UpdatePiece(Piece(piece))).to_vec(),
+        };
+        for message in messages {
+            module.now += MS;
+            module.poll(Some(&message.emit(STATION, !classic)));
+        }
+    }
+    module.step(UpdateStep::Verify, 0)
+}
+
+impl Module<'_> {
+    fn step(&mut self, step: UpdateStep, value: u32) -> Result<u32, ServiceCode> {
+        self.ask(Operation::Update, step as u8, value)
+    }
+
+    fn remark(&mut self) -> u8 {
+        self.controller.heartbeat().mode & !15
+    }
+}
+
+#[test]
+fn a_policy_is_received_tried_and_confirmed_over_the_bus() {
+    for classic in [false, true] {
+        let old = image();
+        let mut module = Module::new(&old);
+        let new = package(&update_image(2), 7, None);
+        let crc = send_policy(&mut module, &new, classic).unwrap();
+        assert_eq!((module.ask(Operation::UpdateStatus, 16, 0), module.remark()), (Ok(3), Heartbeat::LAB));
+        assert_eq!(module.step(UpdateStep::Confirm, crc), Err(ServiceCode::NoUpdate), "it runs with another");
+        assert_eq!(module.step(UpdateStep::Commit, crc), Ok(crc));
+        assert_eq!(module.ask(Operation::UpdateStatus, 16, 0), Ok(4));
+        assert_eq!(module.ask(Operation::Restart, 0, 0), Ok(0));
+        // The next start.
+        let flash = module.board.policies.clone();
+        let fresh = update_image(2);
+        let mut module = Module::on_trial(&fresh, flash);
+        assert_eq!(module.remark(), Heartbeat::LAB | Heartbeat::TRIAL);
+        assert_eq!(module.ask(Operation::Arm, 0, 0), Err(ServiceCode::OnTrial));
+        assert_eq!(module.step(UpdateStep::Begin, 1000 << 16), Err(ServiceCode::OnTrial));
+        assert_eq!(module.step(UpdateStep::Confirm, crc), Ok(crc));
+        assert_eq!((module.remark(), module.ask(Operation::Arm, 0, 0)), (Heartbeat::LAB, Ok(0)));
+        // What happened, the newest first.
+        let log: Vec<_> = (0..5).map(|back| module.ask(Operation::UpdateLog, back, 0)).collect();
+        let low = crc & 0x00ff_ffff;
+        let record = |kind: RecordKind, value: u32| Ok(kind as u32 | 1 << 4 | value << 8);
+        let confirm = record(RecordKind::Confirm, 7);
+        let commit = record(RecordKind::Commit, low);
+        assert_eq!(log, [confirm, confirm, record(RecordKind::Try, low), commit, Err(ServiceCode::NoSuchRegister)]);
+        assert_eq!(module.ask(Operation::UpdateStatus, 17, 0), Ok(7));
+    }
+}
+
+#[test]
+fn a_trial_that_nobody_confirms_ends_with_a_restart() {
+    let old = image();
+    let mut module = Module::new(&old);
+    let new = package(&update_image(2), 0, None);
+    let crc = send_policy(&mut module, &new, false).unwrap();
+    module.step(UpdateStep::Commit, crc).unwrap();
+    let fresh = update_image(2);
+    let mut module = Module::on_trial(&fresh, module.board.policies.clone());
+    let period = u64::from(module.controller.config().timing.period_us);
+    module.run(u64::from(TRIAL_CYCLES) * period);
+    assert!(!module.service.restart_due(module.now), "not yet");
+    module.run(2 * u64::from(TRIAL_CYCLES) * period);
+    assert!(module.service.restart_due(module.now));
+    let again = Updater::start(&mut module.board.policies, page().keys, |_, _| true);
+    assert!(!again.on_trial());
+}
+
+#[test]
+fn a_module_with_a_key_takes_no_changes_of_its_page() {
+    let old = image();
+    let key = test_key(9);
+    let mut module = Module::new(&old);
+    for (word, bytes) in (0..).zip(key.verifying_key().as_bytes().as_chunks::<4>().0) {
+        assert_eq!(module.write(Register::KeyA, word, u32::from_le_bytes(*bytes)), Ok(u32::from_le_bytes(*bytes)));
+    }
+    assert_eq!(module.ask(Operation::Store, 0, 0), Ok(0));
+    let keyed = read_page(&mut module.board.storage).unwrap();
+    assert_eq!(keyed.keys, [*key.verifying_key().as_bytes(), [0; 32]]);
+    let mut module = Module::with_flash(&old, module.board.storage.flash.clone());
+    assert_eq!(module.remark(), 0);
+    for (register, value) in [
+        (Register::TorqueCap, 1e6f32.to_bits()),
+        (Register::KeyA, 0),
+        (Register::KeyB, 1),
+        (Register::JointMax, 3.0f32.to_bits()),
+        (Register::DeadMan, 0),
+    ] {
+        assert_eq!(module.write(register, 0, value), Err(ServiceCode::Locked), "{register:?}");
+    }
+    assert_eq!(module.write(Register::Node, 0, 4), Ok(4), "who it is may change");
+    assert_eq!(module.write(Register::Token, 0, 4), Ok(4));
+    let unsigned = package(&update_image(2), 0, None);
+    assert_eq!(send_policy(&mut module, &unsigned, false), Err(ServiceCode::Unsigned));
+    let signed = package(&update_image(2), 0, Some(&key));
+    assert!(send_policy(&mut module, &signed, false).is_ok());
 }

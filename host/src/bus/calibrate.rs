@@ -503,6 +503,7 @@ mod tests {
     use composer_firmware::controller::{Boot, BusKind, BusStatus, Config};
     use composer_firmware::emulated::Emulated;
     use composer_firmware::node_page::Calibration;
+    use composer_firmware::update::NoPolicies;
     use composer_shared::observation::Sensors;
     use composer_shared::policy::{IMAGE_SIZE, Policy, random_image};
     use composer_shared::wire::Frame;
@@ -589,7 +590,7 @@ mod tests {
 
     /// A module on a bench: its own controller and service, motors that turn its joints, ends that stop them, and somebody who lays it down.
     struct Rig {
-        module: Emulated<'static>,
+        module: Emulated<'static, NoPolicies>,
         sensors: Arc<Mutex<Sensors>>,
         now_us: u64,
         inbox: VecDeque<Frame>,
@@ -655,7 +656,7 @@ mod tests {
         }
         truth.joints[2].reversed = true;
         truth.motors[0].torque_constant *= -1.0;
-        let mut module = Emulated::new(policy);
+        let mut module = Emulated::new(policy, NoPolicies);
         module.start(Config::new(0, 1, BusKind::Fd, &policy), Boot::default(), 0, Calibration::NOMINAL).unwrap();
         module.hardware().mounted = truth;
         let sensors = Sensors { up: [0.0, 0.0, 1.0], temperature: 25.0, ..Sensors::ZERO };

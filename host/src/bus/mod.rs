@@ -13,6 +13,7 @@ pub mod serial;
 #[cfg(target_os = "linux")]
 pub mod socketcan;
 mod station;
+pub mod update;
 
 use std::fmt;
 use std::path::PathBuf;

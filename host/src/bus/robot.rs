@@ -41,7 +41,7 @@ pub struct Module {
 impl Module {
     /// What it is at.
     pub fn mode(&self) -> Option<Mode> {
-        self.heartbeat.and_then(|heartbeat| Mode::from_number(heartbeat.mode))
+        self.heartbeat.and_then(|heartbeat| heartbeat.mode())
     }
 
     /// How it is, by its last STATE, or else by its last HEARTBEAT.

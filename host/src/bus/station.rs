@@ -49,6 +49,8 @@ pub struct Drive {
 fn patience(operation: Operation) -> Duration {
     match operation {
         Operation::Store | Operation::SetNode | Operation::ClearLog => 5 * PATIENCE,
+        // A slot is erased, or a policy hashed and its signature checked.
+        Operation::Update => 15 * PATIENCE,
         _ => PATIENCE,
     }
 }
@@ -121,6 +123,11 @@ impl Station {
         }
         let present = self.robot.present();
         if present.is_empty() { Err(BusError::Nobody) } else { Ok(present) }
+    }
+
+    /// Sends a message that nobody answers.
+    pub fn tell(&mut self, message: &Message) -> Result<(), BusError> {
+        self.send(message)
     }
 
     fn send(&mut self, message: &Message) -> Result<(), BusError> {
@@ -222,7 +229,7 @@ impl Station {
         let sequence = self.ask(ALL_MODULES, operation, index, value)?;
         let mut answers = BTreeMap::new();
         let start = self.now();
-        while let Some(left) = PATIENCE.checked_sub(self.now() - start) {
+        while let Some(left) = patience(operation).checked_sub(self.now() - start) {
             if let Some((node, response)) = self.listen(left)?.as_ref().and_then(Self::answer)
                 && response.operation == operation as u8
                 && response.sequence == sequence

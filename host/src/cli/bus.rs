@@ -13,8 +13,9 @@ use composer_shared::wire::Operation;
 use crate::bus::calibrate::{Axis, Bench, Jog, Turned};
 use crate::bus::config::{self, Restored, RobotFile};
 use crate::bus::monitor::{json_change, json_state, table};
-use crate::bus::{Address, BusError, Drive, Station, registers};
+use crate::bus::{Address, BusError, Drive, Station, registers, update};
 use crate::files::write_whole;
+use crate::signing;
 
 /// How long `identify` flashes a light.
 const IDENTIFY_SECONDS: u32 = 10;
@@ -57,6 +58,20 @@ enum Verb {
     },
     /// Calibrate one module on the bench; `--store` keeps what was found
     Calibrate(Calibrate),
+    /// Give all modules the public key of who may change policy and limits from their next start on. Only a debug probe takes it back
+    Key {
+        /// The public key, as `snakectl key new` writes it
+        file: PathBuf,
+        /// As the second key, for the time in which keys are changed
+        #[arg(long)]
+        second: bool,
+    },
+    /// Write what all modules know of themselves as JSON: who they are, their policies and why they have them, their fault logs
+    ExportLog {
+        /// File [default: print it]
+        #[arg(short, long, value_name = "FILE")]
+        output: Option<PathBuf>,
+    },
 }
 
 #[derive(clap::Args, Clone, Debug)]
@@ -319,6 +334,22 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             Ok(())
         }
         Verb::Calibrate(options) => calibrate(&mut station, options),
+        Verb::Key { file, second } => {
+            let key = signing::public_key(file)?;
+            let nodes = update::give_key(&mut station, &key, *second)?;
+            println!("key {}: {}; it counts from their next start on", signing::name(&key), list(&nodes));
+            Ok(())
+        }
+        Verb::ExportLog { output } => {
+            let text = serde_json::to_string_pretty(&update::export_log(&mut station)?)? + "\n";
+            match output {
+                Some(path) => write_whole(path, text.as_bytes()),
+                None => {
+                    print!("{text}");
+                    Ok(())
+                }
+            }
+        }
     }
 }
 

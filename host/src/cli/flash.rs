@@ -7,12 +7,14 @@ use std::process::{Command, Output};
 use anyhow::{Context, Result, bail};
 use composer_firmware::failsafe::BusOffPolicy;
 use composer_firmware::node_page::NodePage;
+use composer_firmware::update::records::of_new_module;
 use composer_shared::policy::Policy;
+use composer_shared::update::{Key, NO_KEY};
 
-use super::PolicySource;
 use crate::files::{create_folder, write_whole};
 use crate::flash::{CHIP, IMAGE, NOMINAL_CALIBRATION, Plan, calibration, check_image};
 use crate::robot::Robot;
+use crate::signing;
 
 /// Arguments of `flash`.
 #[derive(clap::Args, Clone, Debug)]
@@ -23,9 +25,13 @@ pub struct Arguments {
     /// Modules of the robot
     #[arg(long, value_name = "M", default_value_t = 8)]
     modules: u8,
-    /// Policy image, or the name of one that ships
+    /// Policy image, signed or not, or the name of one that ships
     #[arg(long, value_name = "FILE", default_value = "goal-reaching")]
     policy: String,
+    /// Public key of who may change policy and limits later, as `snakectl key new` writes it; a second one for the time in which keys are changed. Without any the module
+    /// takes what nobody signed
+    #[arg(long, value_name = "FILE")]
+    key: Vec<PathBuf>,
     /// What was measured on this module, and its limits; without it the nominal values of host/configs/calibration.toml
     #[arg(long, value_name = "FILE")]
     calibration: Option<PathBuf>,
@@ -60,10 +66,7 @@ enum BusOff {
 
 /// Runs the verb.
 pub fn run(arguments: &Arguments) -> Result<()> {
-    let policy = match PolicySource::load(&arguments.policy)? {
-        PolicySource::Image(frozen) => frozen.image,
-        _ => bail!("{} is no policy image: freeze a run with `snakectl export` first", arguments.policy),
-    };
+    let package = super::update::load(&arguments.policy)?;
     let page = node_page(arguments)?;
     let bytes = page.encode().context("this module cannot be made")?;
     check_image(&arguments.image)?;
@@ -73,11 +76,14 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let plan = Plan {
         image: arguments.image.clone(),
         policy: folder.join("policy.bin"),
+        records: folder.join("records.bin"),
         node_page: folder.join("node-page.bin"),
         chip: arguments.chip.clone(),
         probe: arguments.probe.clone(),
     };
-    write_whole(&plan.policy, &policy)?;
+    // An image that nobody signed needs no header.
+    write_whole(&plan.policy, if package.signed() { package.bytes() } else { package.image() })?;
+    write_whole(&plan.records, &of_new_module(package.header().counter))?;
     write_whole(&plan.node_page, &bytes)?;
     if !arguments.dry_run {
         find_probe()?;
@@ -105,7 +111,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             );
         }
     }
-    println!("{}", summary(&page, &policy));
+    println!("{}", summary(&page, package.image()));
     Ok(())
 }
 
@@ -124,7 +130,25 @@ fn node_page(arguments: &Arguments) -> Result<NodePage> {
         BusOff::Recover => BusOffPolicy::Recover,
         BusOff::Latch => BusOffPolicy::Latch,
     };
-    Ok(NodePage { node: arguments.node, modules: arguments.modules, bus_off, safety, calibration })
+    Ok(NodePage {
+        node: arguments.node,
+        modules: arguments.modules,
+        bus_off,
+        safety,
+        calibration,
+        keys: keys(&arguments.key)?,
+    })
+}
+
+fn keys(files: &[PathBuf]) -> Result<[Key; 2]> {
+    let mut keys = [NO_KEY; 2];
+    if files.len() > keys.len() {
+        bail!("a module has room for two keys: --key is given {} times", files.len());
+    }
+    for (key, file) in keys.iter_mut().zip(files) {
+        *key = signing::public_key(file)?;
+    }
+    Ok(keys)
 }
 
 /// What the module is now.

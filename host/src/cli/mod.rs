@@ -9,14 +9,17 @@ mod demo;
 mod eval;
 mod export;
 mod flash;
+mod key;
 mod mjcf;
 mod physics;
 mod policy_file;
 mod replay;
 mod report;
+mod sign;
 mod sil;
 mod test;
 mod train;
+mod update;
 
 use std::process::ExitCode;
 
@@ -63,6 +66,12 @@ enum Verb {
     Demo(demo::OneTask),
     /// Make a module of a board: image, policy and node page by a debug probe.
     Flash(flash::Arguments),
+    /// Make a key, or show one: only policies that are signed with it are then taken by modules that have it.
+    Key(key::Arguments),
+    /// Sign a policy.
+    Sign(sign::Arguments),
+    /// Bring a policy to all modules of a robot over its bus.
+    Update(update::Arguments),
     /// Watch and command a robot on its bus, a real one or a simulated one in real time.
     Bus(bus::Arguments),
     /// Print the bus's message database in DBC form.
@@ -101,6 +110,9 @@ pub fn main() -> ExitCode {
         Some(Verb::Report(arguments)) => report::run(&arguments),
         Some(Verb::Bench(arguments)) => bench::run(&arguments),
         Some(Verb::Flash(arguments)) => flash::run(&arguments),
+        Some(Verb::Key(arguments)) => key::run(&arguments),
+        Some(Verb::Sign(arguments)) => sign::run(&arguments),
+        Some(Verb::Update(arguments)) => update::run(&arguments),
         Some(Verb::Bus(arguments)) => bus::run(&arguments),
         Some(Verb::Dbc(arguments)) => dbc::run(&arguments),
         Some(Verb::Mjcf(arguments)) => mjcf::run(&arguments),

@@ -10,12 +10,13 @@ use composer_shared::wire::StopCommand;
 use super::*;
 use crate::computer::Launcher;
 use crate::faults::FaultPlan;
+use crate::policy_flash::Policies;
 use crate::sil::tests::{Toy, image};
 use crate::sil::{self, CycleView, SilConfig, SilError, SilReport};
 
 /// A module in this process at the other end of a line.
 struct Loopback<'a> {
-    module: Module<'a>,
+    module: Module<'a, Policies>,
     receiver: Receiver,
     out: Vec<u8>,
     /// Messages after which somebody takes it away.
@@ -63,7 +64,12 @@ impl<'a> Launcher for Loopbacks<'a> {
         self.started.set(self.started.get() + 1);
         let life = self.victim.filter(|(victim, _)| *victim == config.node).map_or(usize::MAX, |(_, life)| life);
         let out = link::encode(&hello(Some(&self.policy)), &mut [0; MESSAGE_MAX]).to_vec();
-        let line = Loopback { module: Module::new(self.policy), receiver: Receiver::default(), out, life };
+        let line = Loopback {
+            module: Module::new(self.policy, Policies::default()),
+            receiver: Receiver::default(),
+            out,
+            life,
+        };
         Ok(Remote::new(line, config, boot, now))
     }
 }

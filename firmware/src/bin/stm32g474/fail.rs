@@ -4,6 +4,7 @@
 //! overwriting variables.
 
 use core::panic::PanicInfo;
+use core::sync::atomic::{AtomicBool, Ordering};
 
 use cortex_m_rt::{ExceptionFrame, exception};
 use embassy_stm32::pac;
@@ -60,14 +61,30 @@ unsafe fn DefaultHandler(exception: i16) {
     wait_for_watchdog()
 }
 
-/// A double word of the storage that lost its power while it was written has a wrong checksum, which the chip tells by this exception. The reader
-/// finds out by a checksum of its own, so there is nothing else to do.
+/// A double word had a wrong checksum when it was read.
+static CHECKSUM: AtomicBool = AtomicBool::new(false);
+
+/// Begins a reading of flash that may have lost its power.
+pub fn forget_checksum() {
+    CHECKSUM.store(false, Ordering::Relaxed);
+}
+
+/// Whether a double word had a wrong checksum since.
+pub fn checksum_was_wrong() -> bool {
+    // The exception comes with the reading; what is read is used only behind this.
+    cortex_m::asm::dsb();
+    CHECKSUM.load(Ordering::Relaxed)
+}
+
+/// A double word of storage or policies that lost its power while it was written has a wrong checksum, which the chip tells by this exception. The reader
+/// asks for it, or finds out by a checksum of its own.
 #[exception]
 unsafe fn NonMaskableInt() {
     let checked = pac::FLASH.eccr().read();
     if checked.eccd() || checked.eccd2() {
         // Flags are cleared by writing ones.
         pac::FLASH.eccr().modify(|_| {});
+        CHECKSUM.store(true, Ordering::Relaxed);
         return;
     }
     motors_off();

@@ -5,19 +5,20 @@ use composer_firmware::service::{Board, Raw};
 use embassy_stm32::uid;
 
 use crate::drive::Measured;
-use crate::flash::Storage;
+use crate::flash::{Policies, Storage};
 use crate::sense::Sense;
 
 /// Storage, identifier and readings.
 pub struct Hardware {
     storage: Storage,
+    policies: Policies,
     raw: Raw,
 }
 
 impl Hardware {
     /// Nothing was read yet.
-    pub fn new(storage: Storage) -> Self {
-        Hardware { storage, raw: Raw::default() }
+    pub fn new(storage: Storage, policies: Policies) -> Self {
+        Hardware { storage, policies, raw: Raw::default() }
     }
 
     /// Takes what sensors, motors and CAN port say now.
@@ -39,6 +40,11 @@ impl Hardware {
 
 impl Board for Hardware {
     type Flash = Storage;
+    type Policies = Policies;
+
+    fn policies(&mut self) -> &mut Policies {
+        &mut self.policies
+    }
 
     fn storage(&mut self) -> &mut Storage {
         &mut self.storage

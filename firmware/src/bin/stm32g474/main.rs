@@ -54,6 +54,7 @@ use composer_firmware::node_page::NodePage;
 use composer_firmware::port::CanPort;
 use composer_firmware::service::Service;
 use composer_firmware::storage::read_page;
+use composer_firmware::update::Updater;
 use composer_shared::observation::Sensors;
 use composer_shared::policy::Policy;
 use composer_shared::wire::{Fault, Health, Heartbeat, Message, Mode, NOBODY, PROTOCOL_VERSION};
@@ -68,7 +69,7 @@ use static_cell::StaticCell;
 
 use board::{Board, Watchdog};
 use can::Fdcan;
-use flash::Storage;
+use flash::{Policies, Storage};
 use hardware::Hardware;
 use sense::Sense;
 use stop::TORQUE_OFF;
@@ -107,7 +108,13 @@ async fn main(_spawner: Spawner) -> ! {
     };
     defmt::info!("module {=u8} of {=u8}", page.node, page.modules);
     let mut can = Fdcan::new(p.FDCAN1, p.PA11, p.PA12, page.bus_off);
-    let policy = match flash::policy() {
+    let mut policies = Policies::new(&storage);
+    let updater = Updater::start(&mut policies, page.keys, |_, slot| flash::policy(slot).is_ok());
+    let started = updater.started();
+    if started.trial {
+        defmt::info!("the policy in slot {=str} is on trial", started.slot.name());
+    }
+    let policy = match flash::policy(started.slot) {
         Ok(policy) => policy,
         Err(error) => {
             defmt::error!("{}", Display2Format(&error));
@@ -142,8 +149,8 @@ async fn main(_spawner: Spawner) -> ! {
         &page,
         policy.geometry(),
     );
-    let mut hardware = Hardware::new(storage);
-    let service = make_service(page, controller, &mut hardware);
+    let mut hardware = Hardware::new(storage, policies);
+    let service = make_service(page, updater, controller, &mut hardware);
     TORQUE_OFF.follow(boot.stop);
     drive::watch_stop_input(Input::new(p.PB11, Pull::Up), page.node, can::send_at_once);
     let mut parts = Parts { can: &mut can, sense: &mut sense, hardware: &mut hardware, light: &mut light };
@@ -171,9 +178,14 @@ fn make_controller(
 
 /// Makes the service where it stays, for the same reason.
 #[inline(never)]
-fn make_service(page: NodePage, controller: &mut Controller<'static>, hardware: &mut Hardware) -> &'static mut Service {
+fn make_service(
+    page: NodePage,
+    updater: Updater,
+    controller: &mut Controller<'static>,
+    hardware: &mut Hardware,
+) -> &'static mut Service {
     static SERVICE: StaticCell<Service> = StaticCell::new();
-    SERVICE.init_with(|| Service::new(page, controller, now(), hardware))
+    SERVICE.init_with(|| Service::new(page, updater, controller, now(), hardware))
 }
 
 /// What the main loop deals with.
