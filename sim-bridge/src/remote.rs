@@ -118,6 +118,16 @@ impl<L: Line> Remote<L> {
         }
     }
 
+    /// The same computer is to begin anew, as behind a power-on; what its flash has of policies stays.
+    pub fn start_again(&mut self, config: Config, boot: Boot, now: Micros) -> Result<(), Trouble> {
+        self.ensure_started()?;
+        self.send(&ToModule::Start { config, boot, now })?;
+        self.sensors.clear();
+        self.frames.clear();
+        (self.torque, self.asked, self.drained, self.status) = ([0.0; AXES], 0, true, link::Status::off());
+        Ok(())
+    }
+
     /// Waits until it has booted.
     pub fn hello(&mut self) -> Result<Hello, Trouble> {
         let first = self.message()?;

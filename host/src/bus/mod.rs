@@ -10,6 +10,7 @@ pub mod registers;
 mod robot;
 #[cfg(unix)]
 pub mod serial;
+pub mod simulated;
 #[cfg(target_os = "linux")]
 pub mod socketcan;
 mod station;
