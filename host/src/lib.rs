@@ -22,6 +22,7 @@ pub mod policy;
 pub mod recorder;
 pub mod replay;
 pub mod robot;
+pub mod rows;
 pub mod run;
 pub mod run_folder;
 pub mod scenario;

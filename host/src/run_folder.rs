@@ -5,16 +5,25 @@ use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
+use composer_shared::policy::Policy;
 use crc::{CRC_32_ISO_HDLC, Crc};
 use serde_json::Value;
 
 use crate::env::{FaultTraining, SnakeEnv};
 use crate::eval::{Trial, curve_seed, healthy};
 use crate::files::{create_folder, write_whole};
+use crate::freeze::{Parity, freeze, parity};
 use crate::methods::TrainedPolicy;
 use crate::outcome::Report;
 use crate::run::RunConfig;
 use crate::train::{TrainSummary, checkpoint, metrics as log, train};
+
+/// Seeds of the episodes that scales are taken from, and of those that parity is measured on.
+const CALIBRATION_SEED: u64 = 0xca11;
+const HELD_OUT_SEED: u64 = 0x4e1d;
+
+/// Episodes that scales are taken from, and as many others that parity is measured on.
+pub const CALIBRATION_EPISODES: u64 = 24;
 
 /// Settings of a run, in its folder.
 pub const CONFIG_FILE: &str = "config.toml";
@@ -161,6 +170,27 @@ pub fn alone(folder: &Path) -> Result<File> {
         file.lock().with_context(|| format!("cannot lock {}", path.display()))?;
     }
     Ok(file)
+}
+
+/// Freezes the network of a run folder, with scales of `episodes` episodes; the difference of float and integer actions is that of as many others.
+pub fn freeze_run(folder: &Path, episodes: u64, threads: usize) -> Result<(RunConfig, Vec<u8>, Parity)> {
+    let (config, policy) = load_run(folder)?;
+    let network = policy.network().with_context(|| format!("{} cannot be frozen", folder.display()))?;
+    let decides = policy.policy();
+    let env = Arc::new(config.evaluation());
+    let draw = |seed, modules| config.faults.draw(seed, modules);
+    let trial = Trial {
+        config: &env,
+        episodes: episodes as usize,
+        seed: CALIBRATION_SEED,
+        faults: if config.faults.probability > 0.0 { &draw } else { &healthy },
+        threads,
+    };
+    let image = freeze(network, &config.meta(), &trial.observations(&*decides))?;
+    let frozen = Policy::parse(&image).map_err(|e| anyhow::anyhow!("the frozen image is refused: {e}"))?;
+    let held_out = Trial { seed: HELD_OUT_SEED, ..trial }.observations(&*decides);
+    let parity = parity(network, &frozen, &held_out);
+    Ok((config, image, parity))
 }
 
 /// The metrics of a run, one object an iteration.

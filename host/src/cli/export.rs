@@ -9,21 +9,14 @@ use composer_sim_bridge::faults::FaultPlan;
 use serde::{Deserialize, Serialize};
 
 use crate::env::EnvConfig;
-use crate::eval::{PUBLISHED_EPISODES, PUBLISHED_SEED, Trial, healthy};
+use crate::eval::{PUBLISHED_EPISODES, PUBLISHED_SEED, Trial};
 use crate::files::write_whole;
-use crate::freeze::{Parity, freeze, parity};
+use crate::freeze::Parity;
 use crate::outcome::Report;
 use crate::run::RunConfig;
-use crate::run_folder::{load_run, wall_seconds};
+use crate::run_folder::{CALIBRATION_EPISODES, freeze_run, wall_seconds};
 use crate::stats::with_interval;
 use crate::vary::{self, Variation};
-
-/// Seeds of the episodes that scales are taken from, and of those that parity is measured on.
-const CALIBRATION_SEED: u64 = 0xca11;
-const HELD_OUT_SEED: u64 = 0x4e1d;
-
-/// Episodes that scales are taken from, and as many others that parity is measured on.
-pub(super) const CALIBRATION_EPISODES: u64 = 24;
 
 /// Arguments of `export`.
 #[derive(clap::Args, Clone, Debug)]
@@ -181,27 +174,6 @@ pub(super) fn measure(config: &EnvConfig, image: &[u8], row: Row, episodes: u64,
     let trial = Trial { config: &config, episodes: episodes as usize, seed: PUBLISHED_SEED, faults: &draw, threads };
     let report = trial.evaluate(&policy, row.fault, &|| {});
     Ok(Measured { on: row.on.words().into(), ..report.into() })
-}
-
-/// Freezes the network of a run folder, with scales of `episodes` episodes; the difference of float and integer actions is that of as many others.
-pub(super) fn freeze_run(folder: &Path, episodes: u64, threads: usize) -> Result<(RunConfig, Vec<u8>, Parity)> {
-    let (config, policy) = load_run(folder)?;
-    let network = policy.network().with_context(|| format!("{} cannot be frozen", folder.display()))?;
-    let decides = policy.policy();
-    let env = Arc::new(config.evaluation());
-    let draw = |seed, modules| config.faults.draw(seed, modules);
-    let trial = Trial {
-        config: &env,
-        episodes: episodes as usize,
-        seed: CALIBRATION_SEED,
-        faults: if config.faults.probability > 0.0 { &draw } else { &healthy },
-        threads,
-    };
-    let image = freeze(network, &config.meta(), &trial.observations(&*decides))?;
-    let frozen = Policy::parse(&image).map_err(|e| anyhow::anyhow!("the frozen image is refused: {e}"))?;
-    let held_out = Trial { seed: HELD_OUT_SEED, ..trial }.observations(&*decides);
-    let parity = parity(network, &frozen, &held_out);
-    Ok((config, image, parity))
 }
 
 /// A frozen policy with what is known of it.

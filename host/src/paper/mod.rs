@@ -3,7 +3,12 @@
 //! A comparison is a list of runs in a fixed order ([`Comparison::runs`]). Whoever works on it, one process or many on many machines, trains each
 //! run in a folder of its own, all of a run's files in it, so that outputs are merged by being looked at together.
 
+pub mod gather;
+pub mod measure;
 pub mod protocol;
+pub mod publish;
+pub mod published;
+pub mod sections;
 pub mod work;
 
 use std::path::{Path, PathBuf};
@@ -112,9 +117,9 @@ pub struct Shard {
 }
 
 impl Shard {
-    /// The runs of this part: every `of`-th, so that each part has some of the slow methods.
-    pub fn select(self, runs: Vec<Run>) -> Vec<Run> {
-        runs.into_iter().skip(self.index - 1).step_by(self.of).collect()
+    /// What belongs to this part: every `of`-th, so that each part has some of the slow methods.
+    pub fn select<T>(self, all: Vec<T>) -> Vec<T> {
+        all.into_iter().skip(self.index - 1).step_by(self.of).collect()
     }
 }
 

@@ -3,12 +3,19 @@
 use std::path::Path;
 
 use anyhow::{Context, Result, bail};
+use composer_shared::policies;
+use composer_shared::policy::{Policy as Image, Task};
 use crc::{CRC_32_ISO_HDLC, Crc};
 use serde::{Deserialize, Serialize};
 
-use super::Run;
+use super::measure::{Measured, kept, measure};
+use super::{Comparison, Run, Shard, protocol};
+use crate::env::EnvConfig;
 use crate::files::{create_folder, write_whole};
-use crate::run_folder::{NETWORK_FILE, begun, trained};
+use crate::methods::Method;
+use crate::run_folder::{
+    CALIBRATION_EPISODES, CONFIG_FILE, NETWORK_FILE, alone, begun, freeze_run, load_config, load_run, trained,
+};
 use crate::side_by_side::side_by_side;
 use crate::train::checkpoint;
 
@@ -47,7 +54,7 @@ pub fn progress(run: &Run, out: &Path) -> Result<Progress> {
     let folder = run.folder(out);
     let mut config = run.config.clone();
     // It may have been any number of them.
-    if let Ok(was) = crate::run_folder::load_config(&folder.join(crate::run_folder::CONFIG_FILE)) {
+    if let Ok(was) = load_config(&folder.join(CONFIG_FILE)) {
         config.train.threads = was.train.threads;
     }
     if !begun(&folder, &config)? {
@@ -66,8 +73,8 @@ pub fn progress(run: &Run, out: &Path) -> Result<Progress> {
     Ok(Progress::Trained)
 }
 
-/// Trains a run on `threads` threads as far as that is not done. False: interrupted.
-fn finish(run: &Run, out: &Path, threads: usize) -> Result<bool> {
+/// Trains a run on `threads` threads and measures it over so many episodes a point, as far as that is not done. False: interrupted.
+fn finish(run: &Run, out: &Path, episodes: u64, threads: usize) -> Result<bool> {
     let folder = run.folder(out);
     if progress(run, out)? != Progress::Trained {
         if !trained(&folder, &run.config, threads)? {
@@ -78,17 +85,87 @@ fn finish(run: &Run, out: &Path, threads: usize) -> Result<bool> {
         // That of SMP holds its whole replay buffer.
         let _ = std::fs::remove_file(folder.join(checkpoint::FILE));
     }
+    let _alone = alone(&folder)?;
+    let (config, policy) = load_run(&folder)?;
+    let env = config.evaluation();
+    let measured = Measured { rows: &kept(&folder)?, digest: &policy_digest(&folder)?, env: &env, episodes };
+    let image = || match policy.network() {
+        Ok(_) => Ok(Ok(freeze_run(&folder, CALIBRATION_EPISODES, threads)?.1)),
+        Err(why) => Ok(Err(why.to_string())),
+    };
+    measure(
+        &measured,
+        &run.name,
+        &*policy.policy(),
+        run.method() == Method::Composer && run.seed() == 1,
+        image,
+        threads,
+    )?;
     Ok(true)
 }
 
-/// Works on all runs, `jobs` at a time (default: the cores). False: interrupted, the next time it goes on from there.
+/// Digest of the policy in a folder: what its results are kept under.
+pub fn policy_digest(folder: &Path) -> Result<String> {
+    let path = folder.join(NETWORK_FILE);
+    Ok(digest(&std::fs::read(&path).with_context(|| format!("cannot read {}", path.display()))?))
+}
+
+/// Name of the folder with the results of the policy of a task that ships.
+pub fn robust_name(task: Task) -> String {
+    format!("robust-{task}")
+}
+
+/// The environment of the policy of a task that ships, its image and its digest.
+pub fn robust(task: Task) -> Result<(EnvConfig, &'static [u8], String)> {
+    let image = policies::shipped(task.name()).context("a policy ships for every task")?;
+    Ok((protocol::settings(task, Method::Composer, 1, None).evaluation(), image, digest(image)))
+}
+
+/// Measures the policy of a task that ships.
+fn finish_robust(task: Task, out: &Path, episodes: u64, threads: usize) -> Result<()> {
+    let folder = out.join(robust_name(task));
+    let _alone = alone(&folder)?;
+    let (env, image, digest) = robust(task)?;
+    let policy = Image::parse(image).map_err(|e| anyhow::anyhow!("{e}"))?;
+    let measured = Measured { rows: &kept(&folder)?, digest: &digest, env: &env, episodes };
+    measure(&measured, &robust_name(task), &policy, false, || Ok(Ok(image.to_vec())), threads)
+}
+
+/// Works on one part of a comparison, all of it by default, `jobs` pieces at a time (default: the cores). False: interrupted, the next time it goes
+/// on from there.
 ///
 /// # Errors
 ///
 /// If a run has other settings, diverges, or cannot be written.
-pub fn work(runs: &[Run], out: &Path, jobs: Option<u64>) -> Result<bool> {
+pub fn work(
+    comparison: &Comparison,
+    shard: Option<Shard>,
+    out: &Path,
+    episodes: u64,
+    jobs: Option<u64>,
+) -> Result<bool> {
     create_folder(out)?;
-    let folders: Vec<_> = runs.iter().map(|run| run.folder(out)).collect();
+    let mut pieces: Vec<Piece> = comparison.runs()?.into_iter().map(Piece::Run).collect();
+    pieces.extend(comparison.tasks.iter().map(|task| Piece::Robust(*task)));
+    if let Some(shard) = shard {
+        pieces = shard.select(pieces);
+    }
+    let folder = |piece: &Piece| match piece {
+        Piece::Run(run) => run.folder(out),
+        Piece::Robust(task) => out.join(robust_name(*task)),
+    };
+    let folders: Vec<_> = pieces.iter().map(folder).collect();
     let folders: Vec<&Path> = folders.iter().map(|folder| &**folder).collect();
-    side_by_side(&folders, jobs, |number, threads| finish(&runs[number], out, threads).map(drop))
+    side_by_side(&folders, jobs, |number, threads| match &pieces[number] {
+        Piece::Run(run) => finish(run, out, episodes, threads).map(drop),
+        Piece::Robust(task) => finish_robust(*task, out, episodes, threads),
+    })
+}
+
+/// A piece of work.
+enum Piece {
+    /// A run to train and measure.
+    Run(Run),
+    /// The policy of a task that ships, to measure.
+    Robust(Task),
 }

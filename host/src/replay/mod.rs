@@ -300,14 +300,29 @@ impl Recording {
     /// # Errors
     /// When there is nothing to show or a frame does not fit the robot and the scene.
     pub fn to_html(&self) -> Result<String, ReplayError> {
+        Ok(self.page_of(&self.encoded()?))
+    }
+
+    /// Its episodes as the page reads them, in JSON: what [`Recording::page_of`] puts together, elsewhere or later.
+    ///
+    /// # Errors
+    /// As [`Recording::to_html`].
+    pub fn encoded(&self) -> Result<Vec<String>, ReplayError> {
         self.check()?;
-        let episodes = self.episodes.iter().map(|e| self.encode(e)).collect();
-        let data = PageData { format: 2, title: &self.title, robot: &self.robot, summary: &self.summary, episodes };
+        let json = |e| serde_json::to_string(&self.encode(e)).expect("plain data encodes");
+        Ok(self.episodes.iter().map(json).collect())
+    }
+
+    /// The page with these encoded episodes of such a robot instead of its own.
+    pub fn page_of(&self, encoded: &[String]) -> String {
+        let data = PageData { format: 2, title: &self.title, robot: &self.robot, summary: &self.summary };
+        let head = serde_json::to_string(&data).expect("plain data encodes");
+        let head = head.strip_suffix('}').expect("an object ends so");
         // Text cannot close the script element or open a comment in it: '<' appears in JSON strings only.
-        let json = serde_json::to_string(&data).expect("plain data encodes").replace('<', "\\u003c");
+        let json = format!("{head},\"episodes\":[{}]}}", encoded.join(",")).replace('<', "\\u003c");
         let title = self.title.replace('&', "&amp;").replace('<', "&lt;");
         let page = PAGE.replacen("@TITLE@", &title, 1);
-        Ok(page.replacen("@RECORDING@", &json, 1))
+        page.replacen("@RECORDING@", &json, 1)
     }
 
     /// Writes the page to `path`. It is complete or it is not there: a temporary file in the same folder is renamed.
@@ -506,7 +521,6 @@ struct PageData<'a> {
     title: &'a str,
     robot: &'a Robot,
     summary: &'a [(String, String)],
-    episodes: Vec<PageEpisode<'a>>,
 }
 
 #[derive(Serialize)]

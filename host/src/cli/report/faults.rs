@@ -12,7 +12,7 @@ use composer_shared::policy::Task;
 use composer_sim_bridge::faults::{FaultKind, FaultPlan, PlannedFault, Target};
 use serde_json::{Value, json};
 
-use super::rows::{Rows, measured};
+use super::rows::measured;
 use crate::cli::export::Measured;
 use crate::cli::{PolicySource, task_by_name};
 use crate::env::FaultTraining;
@@ -20,6 +20,7 @@ use crate::eval::{PUBLISHED_SEED, Trial, parallel};
 use crate::files::{create_folder, write_whole};
 use crate::methods::curriculum::{CurriculumConfig, SecondStage};
 use crate::plot::{Heatmap, MapWords, heatmaps};
+use crate::rows::Rows;
 use crate::run::RunConfig;
 use crate::run_folder::{load_config, load_run, trained};
 use crate::side_by_side::side_by_side;

@@ -7,7 +7,9 @@ use composer_shared::policy::Task;
 
 use crate::cli::task_by_name;
 use crate::methods::Method;
-use crate::paper::work::{Progress, progress, work};
+use crate::paper::gather::gather;
+use crate::paper::publish::publish;
+use crate::paper::work::work;
 use crate::paper::{Comparison, Shard, protocol};
 
 /// Arguments of `report paper`.
@@ -28,15 +30,24 @@ pub struct Arguments {
     /// Training runs side by side, each on its share of the cores [default: the cores]
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1000))]
     jobs: Option<u64>,
-    /// Train nothing: say how far the runs are
+    /// Train and measure nothing: publish what the runs that are done come to
     #[arg(long)]
     so_far: bool,
-    /// Work on one part of the runs alone, such as 2/8
-    #[arg(long, value_name = "I/N")]
+    /// Work on one part alone, such as 2/8, in the folder --out, and publish nothing; the parts may be anywhere, and begun again as often as needed
+    #[arg(long, value_name = "I/N", conflicts_with_all = ["so_far", "runs", "merge"], requires = "out")]
     shard: Option<Shard>,
-    /// Folder of the training runs
-    #[arg(long, value_name = "DIR", default_value = "runs/paper")]
-    runs: PathBuf,
+    /// Train and measure nothing: publish what the parts in these folders come to together
+    #[arg(long, value_name = "DIR", num_args = 1.., conflicts_with = "runs")]
+    merge: Vec<PathBuf>,
+    /// Episodes of each point, the first of the published ones
+    #[arg(long, default_value_t = 200, value_parser = clap::value_parser!(u64).range(1..=100_000))]
+    episodes: u64,
+    /// Folder of the training runs [default: runs/paper]
+    #[arg(long, value_name = "DIR")]
+    runs: Option<PathBuf>,
+    /// Folder for tables, figures, data and page; of a part: for its runs [default: host/results/paper]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
     /// Change one setting of every run, such as mat.minibatches=4; may be repeated
     #[arg(long = "set", value_name = "KEY=VALUE")]
     settings: Vec<String>,
@@ -54,17 +65,20 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         steps: arguments.steps,
         settings: arguments.settings.clone(),
     };
-    let mut runs = comparison.runs()?;
-    if let Some(shard) = arguments.shard {
-        runs = shard.select(runs);
+    let out = arguments.out.clone().unwrap_or_else(|| "host/results/paper".into());
+    let episodes = arguments.episodes;
+    if arguments.shard.is_some() {
+        return match work(&comparison, arguments.shard, &out, episodes, arguments.jobs)? {
+            true => Ok(()),
+            false => bail!("stopped; the same command goes on from here"),
+        };
     }
-    if !arguments.so_far && !work(&runs, &arguments.runs, arguments.jobs)? {
+    let runs = arguments.runs.clone().unwrap_or_else(|| "runs/paper".into());
+    if !arguments.so_far && arguments.merge.is_empty() && !work(&comparison, None, &runs, episodes, arguments.jobs)? {
         bail!("stopped; the same command goes on from here");
     }
-    let mut done = 0;
-    for run in &runs {
-        done += usize::from(progress(run, &arguments.runs)? == Progress::Trained);
-    }
-    println!("{done} of {} runs are trained", runs.len());
+    let outs = if arguments.merge.is_empty() { vec![runs] } else { arguments.merge.clone() };
+    let tables = publish(&gather(&comparison, &outs, episodes, arguments.so_far)?, &out)?;
+    println!("{tables}\nwritten to {}", out.display());
     Ok(())
 }

@@ -8,14 +8,16 @@ use anyhow::{Context, Result, bail};
 use composer_shared::policy::{Policy, Task};
 use serde_json::{Value, json};
 
-use super::rows::Rows;
-use crate::cli::export::{CALIBRATION_EPISODES, Exported, Measured, SeedRows, freeze_run, measure, rows};
+use crate::cli::export::{Exported, Measured, SeedRows, measure, rows};
 use crate::cli::task_by_name;
 use crate::eval::PUBLISHED_EPISODES;
 use crate::files::{create_folder, write_whole};
 use crate::freeze::Parity;
+use crate::rows::Rows;
 use crate::run::RunConfig;
-use crate::run_folder::{CONFIG_FILE, NETWORK_FILE, begun, load_config, trained, wall_seconds};
+use crate::run_folder::{
+    CALIBRATION_EPISODES, CONFIG_FILE, NETWORK_FILE, begun, freeze_run, load_config, trained, wall_seconds,
+};
 use crate::side_by_side::side_by_side;
 use crate::stats::with_interval;
 

@@ -9,13 +9,14 @@ use composer_shared::policy::Task;
 use composer_sim_bridge::faults::FaultPlan;
 use serde_json::{Value, json};
 
-use super::rows::{Rows, measured};
+use super::rows::measured;
 use crate::cli::export::Measured;
 use crate::cli::physics::Physics;
 use crate::cli::{PolicySource, task_by_name};
 use crate::files::{create_folder, write_whole};
 use crate::robot::Robot;
 use crate::robot::Solver;
+use crate::rows::Rows;
 use crate::stats::with_interval;
 
 /// Arguments of `report robustness`.
