@@ -165,7 +165,8 @@ pub fn gather(comparison: &Comparison, outs: &[PathBuf], episodes: u64, so_far: 
         };
         let complete = read_cells(&measured, &mut outcome);
         let attended = !attends || measured.found_attention().is_some();
-        if !so_far && !(complete && attended && outcome.replay.is_some()) {
+        let measured = complete && attended && outcome.replay.is_some();
+        if !so_far && !measured {
             bail!(
                 "{} is half written: it is not measured with {episodes} episodes yet; the command that began it goes on with it (--so-far \
                  publishes without it)",

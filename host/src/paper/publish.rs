@@ -64,8 +64,11 @@ fn attention(run: &Outcome) -> Option<String> {
     (!maps.is_empty()).then(|| heatmaps(&maps, &words))
 }
 
-/// The replay page with an episode of each method on each task, and which is where: (method, task, number).
-fn replays(results: &Results) -> Result<Option<(String, Vec<(String, String, usize)>)>> {
+/// Which episode of the replay page is of which method and task: their titles and its number.
+type Place = (String, String, usize);
+
+/// The replay page with an episode of each method on each task, and which is where.
+fn replays(results: &Results) -> Result<Option<(String, Vec<Place>)>> {
     let (mut episodes, mut places) = (Vec::new(), Vec::new());
     let mut add = |name: &str, outcome: &Outcome| {
         if let Some(episode) = &outcome.replay {

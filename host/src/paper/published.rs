@@ -10,6 +10,7 @@ pub const TABLED: [Method; 3] = [Method::Ppo, Method::Mappo, Method::Composer];
 pub type Numbers = [(f64, f64); 3];
 
 /// The paper's numbers at a point.
+#[allow(clippy::approx_constant)] // A distance of 3.14 units is no constant of mathematics.
 pub fn numbers(method: Method, point: Point) -> Option<Numbers> {
     let row = TABLED.iter().position(|tabled| *tabled == method)?;
     let columns = match (point.fault, point.modules) {

@@ -144,8 +144,8 @@ pub fn work(
     episodes: u64,
     jobs: Option<u64>,
 ) -> Result<bool> {
+    let mut pieces: Vec<Piece> = comparison.runs()?.into_iter().map(|run| Piece::Run(Box::new(run))).collect();
     create_folder(out)?;
-    let mut pieces: Vec<Piece> = comparison.runs()?.into_iter().map(Piece::Run).collect();
     pieces.extend(comparison.tasks.iter().map(|task| Piece::Robust(*task)));
     if let Some(shard) = shard {
         pieces = shard.select(pieces);
@@ -165,7 +165,7 @@ pub fn work(
 /// A piece of work.
 enum Piece {
     /// A run to train and measure.
-    Run(Run),
+    Run(Box<Run>),
     /// The policy of a task that ships, to measure.
     Robust(Task),
 }
