@@ -16,7 +16,7 @@ use crate::freeze::{Parity, freeze, parity};
 use crate::methods::TrainedPolicy;
 use crate::outcome::Report;
 use crate::run::RunConfig;
-use crate::train::{TrainSummary, checkpoint, metrics as log, train};
+use crate::train::{Beside, TrainSummary, checkpoint, follow, metrics as log, train};
 
 /// Seeds of the episodes that scales are taken from, and of those that parity is measured on.
 const CALIBRATION_SEED: u64 = 0xca11;
@@ -52,8 +52,15 @@ pub fn load_run(folder: &Path) -> Result<(RunConfig, TrainedPolicy)> {
 }
 
 /// Starts a run in the folder `out`, or goes on with the one that is there. Judges the policy every so often, healthy and (if it trains with
-/// faults) faulty, and keeps the policy of the last judgement. `name`: as in [`train()`].
-pub fn train_in(config: &RunConfig, out: &Path, resuming: bool, name: Option<&str>) -> Result<TrainSummary> {
+/// faults) faulty, and keeps the policy of the last judgement. None: the run is that of another rank, which this one only helped.
+pub fn train_in(config: &RunConfig, out: &Path, resuming: bool, beside: &Beside) -> Result<Option<TrainSummary>> {
+    let make = |index: usize| -> Result<Box<dyn crate::environment::Environment>> {
+        Ok(Box::new(SnakeEnv::new(config.environment(index)?)))
+    };
+    if beside.follows() {
+        follow(&config.train, &make, &fingerprint(config), out, resuming, beside)?;
+        return Ok(None);
+    }
     create_folder(out)?;
     if !resuming {
         if out.join(CONFIG_FILE).exists() {
@@ -82,12 +89,9 @@ pub fn train_in(config: &RunConfig, out: &Path, resuming: bool, name: Option<&st
         let _ = save_policy(out, policy);
         scalars
     };
-    let make = |index: usize| -> Result<Box<dyn crate::environment::Environment>> {
-        Ok(Box::new(SnakeEnv::new(config.environment(index)?)))
-    };
-    let summary = train(&config.train, &make, &fingerprint(config), out, resuming, name, &mut evaluate)?;
+    let summary = train(&config.train, &make, &fingerprint(config), out, resuming, beside, &mut evaluate)?;
     save_policy(out, &summary.policy)?;
-    Ok(summary)
+    Ok(Some(summary))
 }
 
 /// What goes into the metrics from an evaluation.
@@ -157,7 +161,8 @@ pub fn trained(folder: &Path, config: &RunConfig, threads: usize) -> Result<bool
         begun = false;
     }
     let name = folder.file_name().unwrap_or_default().to_string_lossy();
-    Ok(!train_in(&config, folder, begun, Some(&name))?.interrupted)
+    let beside = Beside { name: Some(&name), ranks: None };
+    Ok(train_in(&config, folder, begun, &beside)?.is_some_and(|summary| !summary.interrupted))
 }
 
 /// Waits until no other process works in a folder; none begins to as long as the file lives.

@@ -2,6 +2,8 @@
 //! refused. `tests/run` installs HyperQueue in an environment of its own, and GNU parallel.
 #![cfg(unix)]
 
+#[path = "common/browser.rs"]
+mod chromium;
 mod common;
 
 use std::collections::BTreeMap;
@@ -10,6 +12,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
+use chromium::{attribute, browser, open};
 use common::{command, refuse, signal, succeed};
 
 /// Two methods, one task, two seeds, hardly trained: four runs and the policy that ships.
@@ -212,4 +215,26 @@ fn gnu_parallel_and_a_slurm_array_come_to_the_same_bytes() {
     run(&mut slurm("2"));
     run(Command::new(script("parallel.sh")).args(["2", "parts", PROGRAM]).args(TINY));
     merges_to_the_same(here, &["1", "2"]);
+}
+
+#[test]
+fn the_page_opens_offline_in_a_browser_with_a_replay_of_every_method() {
+    let page = &reference()["index.html"];
+    let text = String::from_utf8_lossy(page);
+    for outside in ["https:", "src=", "href=", "@import", "fetch(", "XMLHttpRequest"] {
+        assert!(!text.contains(outside), "the page contains {outside}");
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("index.html");
+    std::fs::write(&path, page).unwrap();
+    let dom = open(&browser(), &path, "");
+    assert_eq!(attribute(&dom, "data-ready"), Some("true"), "the replay is there");
+    // Both methods, and the policy that ships.
+    let to_choose = dom.split("id=\"pick\"").nth(1).and_then(|rest| rest.split("<iframe").next()).unwrap_or_default();
+    assert_eq!(to_choose.matches("<button").count(), 3);
+    for words in
+        ["Learning curves: the paper", "Table III: other lengths", "What integers and lost frames cost", "Watch them"]
+    {
+        assert!(dom.contains(words), "{words}");
+    }
 }

@@ -6,10 +6,11 @@ use anyhow::{Result, bail};
 use composer_shared::policy::Task;
 
 use super::task_by_name;
-use crate::methods::Method;
+use crate::methods::{Method, ranks};
 use crate::robot::Robot;
 use crate::run::RunConfig;
 use crate::run_folder::{CONFIG_FILE, load_config, train_in};
+use crate::train::Beside;
 
 /// Arguments of `train`.
 #[derive(clap::Args, Clone, Debug)]
@@ -41,6 +42,9 @@ pub struct Arguments {
     /// Go on with the run in this folder as if it had never stopped
     #[arg(long, value_name = "DIR", conflicts_with_all = ["out", "config", "method", "seed"])]
     resume: Option<PathBuf>,
+    /// Share the work with the other processes that `composer-ranks` has started (host/mpi): it starts every rank so
+    #[arg(long)]
+    ranks: bool,
     /// Change one setting, such as learning_rate=3e-4 or faults.probability=0.5; may be repeated
     #[arg(long = "set", value_name = "KEY=VALUE")]
     settings: Vec<String>,
@@ -82,7 +86,8 @@ pub fn run(arguments: Arguments) -> Result<()> {
     config.validate()?;
     let name = format!("{}-{}-{}", config.task.name, config.train.method, config.train.seed);
     let out = arguments.resume.or(arguments.out).unwrap_or_else(|| Path::new("runs").join(name));
-    let summary = train_in(&config, &out, resuming, None)?;
+    let ranks = arguments.ranks.then(ranks::on_standard_input).transpose()?;
+    let Some(summary) = train_in(&config, &out, resuming, &Beside { name: None, ranks })? else { return Ok(()) };
     println!(
         "{} after {} steps, {:.0} s since the start or the last resumption: {}",
         if summary.interrupted { "stopped" } else { "done" },

@@ -19,11 +19,13 @@ pub mod on_policy;
 pub mod parameters;
 pub mod ppo;
 pub mod random;
+pub mod ranks;
 pub(crate) mod simd;
 pub mod smp;
 pub mod tensors;
 pub mod workers;
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Result, bail};
@@ -34,6 +36,7 @@ pub use self::composer::Differentiation;
 use self::composer::float::FloatPolicy;
 pub use self::config::TrainConfig;
 pub(crate) use self::random::mix;
+use self::ranks::Ranks;
 use crate::environment::{Environment, Outcome};
 use crate::network::Network;
 use crate::policy::Policy;
@@ -177,6 +180,13 @@ pub trait Algorithm: Send {
     ///
     /// If that was of another method, other settings or another version.
     fn load(&mut self, state: &State, make: MakeEnvironment) -> Result<()>;
+
+    /// Shares the work with other processes from now on; all of them must have the same settings and be at the same iteration.
+    ///
+    /// # Errors
+    ///
+    /// If the method cannot.
+    fn join_ranks(&mut self, ranks: Arc<dyn Ranks>) -> Result<()>;
 }
 
 /// A run of the method that the settings name, which has not begun.

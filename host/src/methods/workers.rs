@@ -4,10 +4,13 @@ use std::sync::{Arc, Mutex};
 
 use rayon::iter::{IntoParallelRefMutIterator, ParallelIterator};
 
+use super::ranks::Ranks;
+
 /// The threads of a run. They live as long as this and its clones do.
 #[derive(Clone, Debug)]
 pub struct Workers {
     pool: Arc<rayon::ThreadPool>,
+    ranks: Option<Arc<dyn Ranks>>,
 }
 
 impl Workers {
@@ -18,7 +21,17 @@ impl Workers {
     /// If the system does not give them.
     pub fn new(threads: usize) -> anyhow::Result<Self> {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.max(1)).build()?;
-        Ok(Self { pool: Arc::new(pool) })
+        Ok(Self { pool: Arc::new(pool), ranks: None })
+    }
+
+    /// Shares the work of a run with other processes from now on.
+    pub fn join_ranks(&mut self, ranks: Arc<dyn Ranks>) {
+        self.ranks = Some(ranks);
+    }
+
+    /// The processes that the work of the run is shared with, if it is.
+    pub fn ranks(&self) -> Option<&dyn Ranks> {
+        self.ranks.as_deref()
     }
 
     /// How many there are.

@@ -8,10 +8,9 @@ use composer_shared::policy::Task;
 use serde::Serialize;
 use serde_json::Value;
 
-use super::measure::{ATTENDED, Attended, Cell, Measured, Point, kept};
-use super::work::{Progress, policy_digest, progress, robust, robust_name};
+use super::measure::{Attended, Cell, Measured, Point, kept};
+use super::work::{Progress, attends, policy_digest, progress, robust, robust_name};
 use super::{Comparison, Run};
-use crate::methods::Method;
 use crate::run_folder::{load_run, metrics};
 use crate::stats::{Line, weighted_line};
 
@@ -27,6 +26,8 @@ pub struct Outcome {
     pub method: String,
     /// Seed of its run; 0 for the policy that ships.
     pub seed: u64,
+    /// Whether it was trained with tuned settings.
+    pub tuned: bool,
     /// Environment steps that it was trained for; 0 if the run is not part of the comparison.
     pub environment_steps: u64,
     /// Learning curve: environment steps and success, on episodes that are the run's own.
@@ -150,11 +151,12 @@ pub fn gather(comparison: &Comparison, outs: &[PathBuf], episodes: u64, so_far: 
         let rows = kept(&folder)?;
         let measured = Measured { rows: &rows, digest: &policy_digest(&folder)?, env: &env, episodes };
         let not_on_the_bus = policy.network().err().map(|why| why.to_string());
-        let attends = run.method() == Method::Composer && run.seed() == 1 && ATTENDED.contains(&run.task());
+        let attends = attends(run);
         let mut outcome = Outcome {
             task: TaskName(run.task()),
             method: run.method().name().into(),
             seed: run.seed(),
+            tuned: run.tuned,
             environment_steps: config.train.total_steps,
             curve: curve(&log),
             end: end(&log),
@@ -163,7 +165,7 @@ pub fn gather(comparison: &Comparison, outs: &[PathBuf], episodes: u64, so_far: 
             attention: measured.found_attention().filter(|_| attends).flatten(),
             replay: measured.found_replay(),
         };
-        let complete = read_cells(&measured, &mut outcome);
+        let complete = read_cells(&measured, &run.points(), &mut outcome);
         let attended = !attends || measured.found_attention().is_some();
         let measured = complete && attended && outcome.replay.is_some();
         if !so_far && !measured {
@@ -181,6 +183,7 @@ pub fn gather(comparison: &Comparison, outs: &[PathBuf], episodes: u64, so_far: 
             task: TaskName(task),
             method: "robust".into(),
             seed: 0,
+            tuned: false,
             environment_steps: 0,
             curve: Vec::new(),
             end: None,
@@ -193,7 +196,7 @@ pub fn gather(comparison: &Comparison, outs: &[PathBuf], episodes: u64, so_far: 
         for out in outs.iter().map(|out| out.join(robust_name(task))).filter(|out| out.is_dir()) {
             let rows = kept(&out)?;
             let measured = Measured { rows: &rows, digest: &digest, env: &env, episodes };
-            complete |= read_cells(&measured, &mut outcome);
+            complete |= read_cells(&measured, &Point::all(task), &mut outcome);
             outcome.replay = outcome.replay.take().or(measured.found_replay());
         }
         if !complete && !so_far {
@@ -208,10 +211,10 @@ pub fn gather(comparison: &Comparison, outs: &[PathBuf], episodes: u64, so_far: 
 }
 
 /// Reads all points that have been measured; whether none is missing.
-fn read_cells(measured: &Measured, outcome: &mut Outcome) -> bool {
+fn read_cells(measured: &Measured, points: &[Point], outcome: &mut Outcome) -> bool {
     let mut complete = true;
-    for point in Point::all(outcome.task.0) {
-        match measured.found(point) {
+    for point in points {
+        match measured.found(*point) {
             Some(cell) => drop(outcome.cells.insert(point.to_string(), cell)),
             None => complete &= point.bus && outcome.not_on_the_bus.is_some(),
         }

@@ -10,7 +10,7 @@ use composer_shared::policy::{Policy as Image, Task};
 use composer_sim_bridge::faults::FaultPlan;
 use serde::{Deserialize, Serialize};
 
-use crate::bus_trial::{BusSettings, BusTrial};
+use crate::bus_trial::{BusSettings, BusTrial, Written};
 use crate::env::{EnvConfig, SnakeEnv};
 use crate::eval::{DEFAULT_SEED, PUBLISHED_SEED, Trial, episode_seed, healthy, run_episode};
 use crate::outcome::Report;
@@ -156,7 +156,7 @@ impl Measured<'_> {
                 parity: false,
                 elsewhere: None,
             };
-            Ok(trial.run(None, &|| {})?.0.task.into())
+            Ok(trial.run(&Written::default(), &|| {})?.0.task.into())
         })
     }
 
@@ -201,22 +201,22 @@ impl Measured<'_> {
     }
 }
 
-/// Measures everything of a policy as far as that is not done; `image`: what goes onto the bus, made when it is needed, or why there is none.
+/// Measures some points of a policy and what there is to look at, as far as that is not done; `image`: what goes onto the bus, made when it is needed, or why there is none.
 pub fn measure(
     measured: &Measured,
     name: &str,
     policy: &dyn Policy,
+    points: Vec<Point>,
     attends: bool,
     image: impl FnOnce() -> Result<Result<Vec<u8>, String>>,
     threads: usize,
 ) -> Result<()> {
-    let task = measured.env.task.task();
-    let (on_bus, in_simulator): (Vec<_>, Vec<_>) = Point::all(task).into_iter().partition(|point| point.bus);
+    let (on_bus, in_simulator): (Vec<_>, Vec<_>) = points.into_iter().partition(|point| point.bus);
     for point in in_simulator {
         measured.cell(point, policy, None, threads)?;
     }
     measured.replay(name, policy)?;
-    if attends && ATTENDED.contains(&task) {
+    if attends {
         measured.attention(policy)?;
     }
     if on_bus.iter().all(|point| measured.found(*point).is_some()) {

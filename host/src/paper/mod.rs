@@ -9,6 +9,7 @@ pub mod protocol;
 pub mod publish;
 pub mod published;
 pub mod sections;
+pub mod tune;
 pub mod work;
 
 use std::path::{Path, PathBuf};
@@ -16,6 +17,8 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, bail};
 use composer_shared::policy::Task;
 
+use self::measure::Point;
+use self::tune::Tuned;
 use crate::methods::Method;
 use crate::run::RunConfig;
 
@@ -32,6 +35,8 @@ pub struct Comparison {
     pub steps: Option<u64>,
     /// Settings of every run that are not the protocol's, `key=value`.
     pub settings: Vec<String>,
+    /// Settings that have been tuned: every run is there once more with those of its method and task.
+    pub tuned: Option<Tuned>,
 }
 
 impl Default for Comparison {
@@ -42,6 +47,7 @@ impl Default for Comparison {
             seeds: protocol::SEEDS.to_vec(),
             steps: None,
             settings: Vec::new(),
+            tuned: None,
         }
     }
 }
@@ -53,6 +59,8 @@ pub struct Run {
     pub name: String,
     /// All settings.
     pub config: RunConfig,
+    /// Whether they have been tuned.
+    pub tuned: bool,
 }
 
 impl Run {
@@ -69,6 +77,12 @@ impl Run {
     /// For what.
     pub fn task(&self) -> Task {
         self.config.task.name
+    }
+
+    /// What is measured of it: with tuned settings, success alone.
+    pub fn points(&self) -> Vec<Point> {
+        let all = Point::all(self.task());
+        if self.tuned { all[..1].to_vec() } else { all }
     }
 
     /// With which seed.
@@ -94,8 +108,19 @@ impl Comparison {
                         config.set(setting)?;
                     }
                     config.validate()?;
-                    runs.push(Run { name: format!("{task}-{method}-{seed}"), config });
+                    runs.push(Run { name: format!("{task}-{method}-{seed}"), config, tuned: false });
                 }
+            }
+        }
+        if let Some(tuned) = &self.tuned {
+            for mut run in runs.clone() {
+                for setting in tuned.of(run.task(), run.method())? {
+                    run.config.set(setting)?;
+                }
+                run.config.validate()?;
+                run.name = format!("{}-{}-tuned-{}", run.task(), run.method(), run.seed());
+                run.tuned = true;
+                runs.push(run);
             }
         }
         if let Some(twice) =

@@ -32,7 +32,7 @@ pub const CURVE_POINTS: u64 = 10;
 /// Episodes of a point: of at most 125 steps, so that all points together take less than a tenth of the steps of the run.
 pub const CURVE_EPISODES: u64 = 40;
 /// Learning rate of COMPOSER and its ablations at the start: that of the policies that ship.
-const COMPOSER_RATE: f64 = 7e-4;
+pub const COMPOSER_RATE: f64 = 7e-4;
 /// Widths of the hidden layers of SMP's networks on the way down; its authors' are 400 and 300.
 pub const SMP_WIDTHS: [usize; 2] = [64, 64];
 /// SMP's updates for each environment step; its authors' is 1.

@@ -4,6 +4,7 @@ use composer_shared::policy::Task;
 
 use super::gather::{Outcome, Results};
 use super::measure::{Cell, FAULTS, LENGTHS, LOST, Point, TABLED};
+use super::tune::Tuned;
 use super::{protocol, published};
 use crate::methods::Method;
 use crate::plot::mean_and_error;
@@ -91,9 +92,14 @@ fn healthy() -> Point {
 }
 
 impl Results {
-    /// The runs of a method on a task, by their seeds.
+    /// The runs of a method on a task with its own settings, by their seeds.
     pub fn of(&self, method: Method, task: Task) -> Vec<&Outcome> {
-        self.runs.iter().filter(|run| run.method == method.name() && run.task.0 == task).collect()
+        self.having(method, task, false)
+    }
+
+    fn having(&self, method: Method, task: Task, tuned: bool) -> Vec<&Outcome> {
+        let wanted = |run: &&Outcome| run.method == method.name() && run.task.0 == task && run.tuned == tuned;
+        self.runs.iter().filter(wanted).collect()
     }
 
     /// The methods compared, in the order of the tables.
@@ -153,6 +159,7 @@ impl Results {
             sections.push(self.table("Table III as integer controllers on the bus", &lengths, true));
         }
         sections.push(self.bus());
+        sections.extend(self.comparison.tuned.as_ref().map(|tuned| self.tuned(tuned)));
         sections
     }
 
@@ -362,6 +369,32 @@ impl Results {
         Section { title: heading.into(), text: vec![text], head, rows }
     }
 
+    fn tuned(&self, tuned: &Tuned) -> Section {
+        let tasks = &self.comparison.tasks;
+        let mut rows = Vec::new();
+        for method in self.methods() {
+            let of = |task: &Task| {
+                let runs = self.having(method, *task, true);
+                let cells = runs.iter().filter_map(|run| run.cell(healthy()));
+                let success: Vec<f64> = cells.map(|cell| cell.success_rate).collect();
+                let settings = tuned.of(*task, method).unwrap_or_default().join(", ");
+                let settings = if settings.is_empty() { "its own".into() } else { settings };
+                format!("{}; {settings}", spread(&success, 2, self.comparison.seeds.len()))
+            };
+            rows.push(std::iter::once(title(method).into()).chain(tasks.iter().map(of)).collect());
+        }
+        Section {
+            title: "With settings tuned equally".into(),
+            text: vec![format!(
+                "Every method had {} trials on every task, of half the steps each, with seeds that are used for nothing else; the best settings were \
+                 trained anew with the seeds of the comparison. Success on eight healthy modules, and the settings.",
+                tuned.trials
+            )],
+            head: std::iter::once("tuned".into()).chain(tasks.iter().map(|task| task.title().into())).collect(),
+            rows,
+        }
+    }
+
     fn bus(&self) -> Section {
         let mut rows = Vec::new();
         let mut text = vec![format!(
@@ -371,7 +404,7 @@ impl Results {
         )];
         let tasks = &self.comparison.tasks;
         for method in self.methods() {
-            let runs: Vec<_> = self.runs.iter().filter(|run| run.method == method.name()).collect();
+            let runs: Vec<_> = self.runs.iter().filter(|run| run.method == method.name() && !run.tuned).collect();
             if let Some(why) = runs.iter().find_map(|run| run.not_on_the_bus.clone()) {
                 text.push(format!("Not on the bus: {why}."));
                 continue;

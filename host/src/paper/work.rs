@@ -8,7 +8,8 @@ use composer_shared::policy::{Policy as Image, Task};
 use crc::{CRC_32_ISO_HDLC, Crc};
 use serde::{Deserialize, Serialize};
 
-use super::measure::{Measured, kept, measure};
+use super::measure::{ATTENDED, Measured, Point, kept, measure};
+use super::tune::{self, Tuned};
 use super::{Comparison, Run, Shard, protocol};
 use crate::env::EnvConfig;
 use crate::files::{create_folder, write_whole};
@@ -73,8 +74,8 @@ pub fn progress(run: &Run, out: &Path) -> Result<Progress> {
     Ok(Progress::Trained)
 }
 
-/// Trains a run on `threads` threads and measures it over so many episodes a point, as far as that is not done. False: interrupted.
-fn finish(run: &Run, out: &Path, episodes: u64, threads: usize) -> Result<bool> {
+/// Trains a run on `threads` threads as far as that is not done. False: interrupted.
+fn finish_training(run: &Run, out: &Path, threads: usize) -> Result<bool> {
     let folder = run.folder(out);
     if progress(run, out)? != Progress::Trained {
         if !trained(&folder, &run.config, threads)? {
@@ -85,6 +86,15 @@ fn finish(run: &Run, out: &Path, episodes: u64, threads: usize) -> Result<bool> 
         // That of SMP holds its whole replay buffer.
         let _ = std::fs::remove_file(folder.join(checkpoint::FILE));
     }
+    Ok(true)
+}
+
+/// Trains a run on `threads` threads and measures it over so many episodes a point, as far as that is not done. False: interrupted.
+fn finish(run: &Run, out: &Path, episodes: u64, threads: usize) -> Result<bool> {
+    let folder = run.folder(out);
+    if !finish_training(run, out, threads)? {
+        return Ok(false);
+    }
     let _alone = alone(&folder)?;
     let (config, policy) = load_run(&folder)?;
     let env = config.evaluation();
@@ -93,15 +103,14 @@ fn finish(run: &Run, out: &Path, episodes: u64, threads: usize) -> Result<bool> 
         Ok(_) => Ok(Ok(freeze_run(&folder, CALIBRATION_EPISODES, threads)?.1)),
         Err(why) => Ok(Err(why.to_string())),
     };
-    measure(
-        &measured,
-        &run.name,
-        &*policy.policy(),
-        run.method() == Method::Composer && run.seed() == 1,
-        image,
-        threads,
-    )?;
+    let points = run.points();
+    measure(&measured, &run.name, &*policy.policy(), points, attends(run), image, threads)?;
     Ok(true)
+}
+
+/// Whether it is drawn where the modules of a run attend: of the first run of COMPOSER on the tasks of the paper's figure.
+pub fn attends(run: &Run) -> bool {
+    !run.tuned && run.method() == Method::Composer && run.seed() == 1 && ATTENDED.contains(&run.task())
 }
 
 /// Digest of the policy in a folder: what its results are kept under.
@@ -128,7 +137,7 @@ fn finish_robust(task: Task, out: &Path, episodes: u64, threads: usize) -> Resul
     let (env, image, digest) = robust(task)?;
     let policy = Image::parse(image).map_err(|e| anyhow::anyhow!("{e}"))?;
     let measured = Measured { rows: &kept(&folder)?, digest: &digest, env: &env, episodes };
-    measure(&measured, &robust_name(task), &policy, false, || Ok(Ok(image.to_vec())), threads)
+    measure(&measured, &robust_name(task), &policy, Point::all(task), false, || Ok(Ok(image.to_vec())), threads)
 }
 
 /// Works on one part of a comparison, all of it by default, `jobs` pieces at a time (default: the cores). False: interrupted, the next time it goes
@@ -160,6 +169,21 @@ pub fn work(
         Piece::Run(run) => finish(run, out, episodes, threads).map(drop),
         Piece::Robust(task) => finish_robust(*task, out, episodes, threads),
     })
+}
+
+/// Trains all trials of a tuning and chooses among them. None: interrupted, the next time it goes on from there.
+///
+/// # Errors
+///
+/// As [`work`].
+pub fn tune(comparison: &Comparison, trials: u64, out: &Path, jobs: Option<u64>) -> Result<Option<Tuned>> {
+    let (runs, trials_in) = (tune::trials(comparison, trials)?, tune::folder(out));
+    create_folder(&trials_in)?;
+    let folders: Vec<_> = runs.iter().map(|run| run.folder(&trials_in)).collect();
+    let folders: Vec<&Path> = folders.iter().map(|folder| &**folder).collect();
+    let done =
+        side_by_side(&folders, jobs, |number, threads| finish_training(&runs[number], &trials_in, threads).map(drop))?;
+    if done { tune::choose(comparison, trials, out).map(Some) } else { Ok(None) }
 }
 
 /// A piece of work.

@@ -15,6 +15,7 @@ use anyhow::{Context, Result, bail};
 use self::checkpoint::Checkpoint;
 use self::metrics::Metrics;
 use self::progress::Progress;
+use crate::methods::ranks::Ranks;
 use crate::methods::{Algorithm, MakeEnvironment, Report, TrainConfig, TrainedPolicy, create};
 
 /// What a run came to.
@@ -32,6 +33,30 @@ pub struct TrainSummary {
     pub wall: Duration,
     /// What the last evaluation said.
     pub evaluation: Vec<(String, f64)>,
+}
+
+/// What goes on beside a run.
+#[derive(Clone, Debug, Default)]
+pub struct Beside<'a> {
+    /// Other runs: its name tells their progress apart.
+    pub name: Option<&'a str>,
+    /// Other processes that work on the same run.
+    pub ranks: Option<Arc<dyn Ranks>>,
+}
+
+impl Beside<'_> {
+    /// Whether this process does not lead: another one writes what there is to write.
+    pub fn follows(&self) -> bool {
+        self.ranks.as_ref().is_some_and(|ranks| ranks.rank() > 0)
+    }
+
+    /// Whether any of the processes says so.
+    fn anybody(&self, says: bool) -> bool {
+        match &self.ranks {
+            Some(ranks) => ranks.all_gather(&[says.into()]).concat().contains(&1),
+            None => says,
+        }
+    }
 }
 
 /// Judges a policy after so many steps; what it returns goes into the metrics under these names.
@@ -142,36 +167,30 @@ pub fn config_of(checkpoint: &Checkpoint) -> Result<TrainConfig> {
 ///
 /// `fingerprint` says in the caller's words what is trained for (robot, task, difficulty); a checkpoint of another is refused. With
 /// `resume` the run in `out` goes on as if it had never stopped. Ctrl-C or SIGTERM ends the run with a checkpoint after the running
-/// iteration; a second one ends it at once. A `name` tells the progress of runs that go on side by side apart.
+/// iteration; a second one ends it at once.
 pub fn train(
     config: &TrainConfig,
     make: MakeEnvironment,
     fingerprint: &str,
     out: &Path,
     resume: bool,
-    name: Option<&str>,
+    beside: &Beside,
     on_evaluate: Evaluate,
 ) -> Result<TrainSummary> {
     let began = Instant::now();
     config.validate()?;
     std::fs::create_dir_all(out).with_context(|| format!("the folder {} cannot be made", out.display()))?;
-    let mut trainer = if resume {
-        let checkpoint = Checkpoint::read(out)?;
-        Trainer::resume(&checkpoint, config, make, fingerprint)
-            .with_context(|| format!("the run in {} cannot be resumed", out.display()))?
-    } else {
-        if out.join(checkpoint::FILE).exists() {
-            bail!("{} already holds a run: resume it with --resume, or choose another folder", out.display());
-        }
-        Trainer::new(config, make, fingerprint)?
-    };
+    if !resume && out.join(checkpoint::FILE).exists() {
+        bail!("{} already holds a run: resume it with --resume, or choose another folder", out.display());
+    }
+    let mut trainer = begin(config, make, fingerprint, out, resume, beside)?;
     // Before anything is computed: a folder that cannot be written to must not cost an hour.
     trainer.checkpoint()?.write(out)?;
     let cannot_log = || format!("the metrics cannot be written to {}; the last checkpoint is whole", out.display());
     let mut metrics = Metrics::open(out, trainer.iteration(), trainer.steps()).with_context(cannot_log)?;
 
     let stop = Signals::new()?;
-    let mut progress = Progress::new(trainer.total_steps(), trainer.steps(), name);
+    let mut progress = Progress::new(trainer.total_steps(), trainer.steps(), beside.name);
     let mut saved = Instant::now();
     let mut evaluation = Vec::new();
     let mut interrupted = false;
@@ -203,7 +222,7 @@ pub fn train(
         ];
         progress.update(steps, &report.times, &shown);
 
-        interrupted = stop.raised() && !last;
+        interrupted = beside.anybody(stop.raised()) && !last;
         if last || interrupted || saved.elapsed().as_secs_f64() >= config.checkpoint_seconds {
             trainer.checkpoint()?.write(out)?;
             saved = Instant::now();
@@ -222,6 +241,53 @@ pub fn train(
         wall: began.elapsed(),
         evaluation,
     })
+}
+
+/// A run that begins, or goes on from the checkpoint in `out`.
+fn begin(
+    config: &TrainConfig,
+    make: MakeEnvironment,
+    fingerprint: &str,
+    out: &Path,
+    resume: bool,
+    beside: &Beside,
+) -> Result<Trainer> {
+    let mut trainer = if resume {
+        let checkpoint = Checkpoint::read(out)?;
+        Trainer::resume(&checkpoint, config, make, fingerprint)
+            .with_context(|| format!("the run in {} cannot be resumed", out.display()))?
+    } else {
+        Trainer::new(config, make, fingerprint)?
+    };
+    if let Some(ranks) = &beside.ranks {
+        trainer.algorithm.join_ranks(Arc::clone(ranks))?;
+    }
+    Ok(trainer)
+}
+
+/// Does the share of a rank that is not the first in a run that the first one [trains](train): it writes nothing.
+///
+/// # Errors
+///
+/// As [`train`].
+pub fn follow(
+    config: &TrainConfig,
+    make: MakeEnvironment,
+    fingerprint: &str,
+    out: &Path,
+    resume: bool,
+    beside: &Beside,
+) -> Result<()> {
+    config.validate()?;
+    let mut trainer = begin(config, make, fingerprint, out, resume, beside)?;
+    let stop = Signals::new()?;
+    while trainer.iteration() < trainer.total_iterations() {
+        trainer.iterate()?;
+        if beside.anybody(stop.raised()) {
+            break;
+        }
+    }
+    Ok(())
 }
 
 /// Notices Ctrl-C and SIGTERM while it lives; the second one ends the process.
@@ -357,6 +423,49 @@ mod tests {
         }
     }
 
+    #[test]
+    fn ranks_come_to_the_checkpoint_of_one_process_bit_for_bit_and_go_on_from_it_in_another_number() {
+        // Chunks of 64 samples: two in each minibatch.
+        let config = |method| TrainConfig { rollout_steps: 48, total_steps: 4 * 192, threads: 1, ..small(method) };
+        for config in [config(Method::Composer), TrainConfig { method: Method::Mat, ..small_baseline(Method::Mat) }] {
+            // What MAT has too few environments for, a rank that has none must do, too.
+            let mut alone = Trainer::new(&config, &same_teams, "trivial").unwrap();
+            let reports: Vec<_> = (0..4).map(|_| format!("{:?}", alone.iterate().unwrap().scalars)).collect();
+            let run = |count: usize, from: Option<&Checkpoint>, iterations: usize| -> Checkpoint {
+                let work = |ranks: Arc<dyn Ranks>| {
+                    let begun = from.map(|from| Trainer::resume(from, &config, &same_teams, "trivial"));
+                    let mut trainer = begun.unwrap_or_else(|| Trainer::new(&config, &same_teams, "trivial")).unwrap();
+                    trainer.algorithm.join_ranks(ranks).unwrap();
+                    for expected in &reports[trainer.iteration() as usize..][..iterations] {
+                        assert_eq!(format!("{:?}", trainer.iterate().unwrap().scalars), *expected);
+                    }
+                    trainer.checkpoint().unwrap()
+                };
+                let ranks = crate::methods::ranks::tests::in_this_process(count);
+                let ends: Vec<Checkpoint> = std::thread::scope(|scope| {
+                    let begin = |ranks| scope.spawn(|| work(Arc::new(ranks)));
+                    let all: Vec<_> = ranks.into_iter().map(begin).collect();
+                    all.into_iter().map(|rank| rank.join().unwrap()).collect()
+                });
+                assert!(ends.iter().all(|end| *end == ends[0]));
+                ends[0].clone()
+            };
+            let half = run(2, None, 2);
+            assert_eq!(run(3, Some(&half), 2), alone.checkpoint().unwrap());
+        }
+        let smp = small_baseline(Method::Smp);
+        let mut smp = Trainer::new(&smp, &same_teams, "trivial").unwrap();
+        let [ranks] = crate::methods::ranks::tests::in_this_process(1).try_into().unwrap();
+        assert!(
+            smp.algorithm.join_ranks(Arc::new(ranks)).unwrap_err().to_string().contains("smp learns in one process")
+        );
+    }
+
+    /// Teams of three that do not differ.
+    fn same_teams(_index: usize) -> Result<Box<dyn Environment>> {
+        Ok(Box::new(Trivial::new(3, Told::Head)))
+    }
+
     /// Settings with which every baseline is quick.
     fn small_baseline(method: Method) -> TrainConfig {
         let mut config = TrainConfig { method, total_steps: 6 * 96, ..TrainConfig::default() };
@@ -449,7 +558,7 @@ mod tests {
         let quiet = |_: &TrainedPolicy, steps: u64| vec![("eval/steps".to_string(), steps as f64)];
         let config = TrainConfig { total_steps: 4 * 96, evaluate_every: 200, ..small(Method::ComposerNeither) };
         let (a, b) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-        let whole = train(&config, make, "trivial", a.path(), false, None, &mut { quiet }).unwrap();
+        let whole = train(&config, make, "trivial", a.path(), false, &Beside::default(), &mut { quiet }).unwrap();
         assert_eq!((whole.steps, whole.iterations, whole.interrupted), (384, 4, false));
         assert_eq!(whole.evaluation, [("eval/steps".to_string(), 384.0)]);
 
@@ -458,7 +567,7 @@ mod tests {
         half.iterate().unwrap();
         half.iterate().unwrap();
         half.checkpoint().unwrap().write(b.path()).unwrap();
-        let resumed = train(&config, make, "trivial", b.path(), true, None, &mut { quiet }).unwrap();
+        let resumed = train(&config, make, "trivial", b.path(), true, &Beside::default(), &mut { quiet }).unwrap();
         assert_eq!(resumed.policy, whole.policy);
         assert_eq!(Checkpoint::read(a.path()).unwrap(), Checkpoint::read(b.path()).unwrap());
         let lines = std::fs::read_to_string(b.path().join(metrics::FILE)).unwrap();
@@ -496,7 +605,7 @@ mod tests {
 
         let folder = tempfile::tempdir().unwrap();
         let run = |resume| {
-            train(&config, &teams, "trivial", folder.path(), resume, None, &mut |_, _| Vec::new())
+            train(&config, &teams, "trivial", folder.path(), resume, &Beside::default(), &mut |_, _| Vec::new())
                 .err()
                 .unwrap()
                 .to_string()

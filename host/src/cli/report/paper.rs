@@ -9,7 +9,8 @@ use crate::cli::task_by_name;
 use crate::methods::Method;
 use crate::paper::gather::gather;
 use crate::paper::publish::publish;
-use crate::paper::work::work;
+use crate::paper::tune::{FILE, Tuned};
+use crate::paper::work::{tune, work};
 use crate::paper::{Comparison, Shard, protocol};
 
 /// Arguments of `report paper`.
@@ -48,6 +49,12 @@ pub struct Arguments {
     /// Folder for tables, figures, data and page; of a part: for its runs [default: host/results/paper]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
+    /// Tune first: so many trials of every method on every task, each of half the steps; what is best goes to tuned.json in the folder of the runs
+    #[arg(long, value_name = "TRIALS", conflicts_with_all = ["shard", "merge", "tuned", "so_far"], value_parser = clap::value_parser!(u64).range(1..=1000))]
+    tune: Option<u64>,
+    /// Every run once more with the settings of this file, which --tune has written
+    #[arg(long, value_name = "FILE")]
+    tuned: Option<PathBuf>,
     /// Change one setting of every run, such as mat.minibatches=4; may be repeated
     #[arg(long = "set", value_name = "KEY=VALUE")]
     settings: Vec<String>,
@@ -64,6 +71,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         seeds: or(&arguments.seeds, &protocol::SEEDS),
         steps: arguments.steps,
         settings: arguments.settings.clone(),
+        tuned: arguments.tuned.as_deref().map(Tuned::load).transpose()?,
     };
     let out = arguments.out.clone().unwrap_or_else(|| "host/results/paper".into());
     let episodes = arguments.episodes;
@@ -74,6 +82,14 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         };
     }
     let runs = arguments.runs.clone().unwrap_or_else(|| "runs/paper".into());
+    if let Some(trials) = arguments.tune {
+        let Some(tuned) = tune(&comparison, trials, &runs, arguments.jobs)? else {
+            bail!("stopped; the same command goes on from here");
+        };
+        println!("{}", serde_json::to_string_pretty(&tuned.settings)?);
+        println!("written to {}; --tuned trains with it", runs.join(FILE).display());
+        return Ok(());
+    }
     if !arguments.so_far && arguments.merge.is_empty() && !work(&comparison, None, &runs, episodes, arguments.jobs)? {
         bail!("stopped; the same command goes on from here");
     }

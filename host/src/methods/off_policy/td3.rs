@@ -1,6 +1,7 @@
 //! TD3 (Fujimoto et al. 2018): two critics whose lesser counts, noise on the target's action, an actor that is stepped less often, and targets
 //! that follow slowly.
 
+use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
@@ -16,6 +17,7 @@ use crate::methods::on_policy::collect::{ACTIONS, episode_seed};
 use crate::methods::on_policy::{RolloutWorker, Widths};
 use crate::methods::parameters::Adam;
 use crate::methods::random::{Stream, normal_noise, stream};
+use crate::methods::ranks::Ranks;
 use crate::methods::tensors::{Layout, Weights, floats, scalar};
 use crate::methods::{
     Algorithm, EpisodeState, LearnerState, MakeEnvironment, Report, State, Times, TrainedPolicy, checked,
@@ -324,6 +326,13 @@ impl<N: DeterministicActorCritic> Algorithm for OffPolicy<N> {
 
     fn steps_per_iteration(&self) -> u64 {
         (self.settings.environments * self.settings.rollout_steps) as u64
+    }
+
+    fn join_ranks(&mut self, _ranks: Arc<dyn Ranks>) -> Result<()> {
+        bail!(
+            "{} learns in one process: its updates are one after the other, on batches too small to share",
+            self.config.method
+        )
     }
 
     fn save(&self) -> State {

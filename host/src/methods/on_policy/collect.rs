@@ -2,6 +2,7 @@
 //!
 //! No group waits for another, and nothing an environment does depends on which thread runs it or when.
 
+use std::ops::Range;
 use std::time::{Duration, Instant};
 
 use rand_chacha::ChaCha8Rng;
@@ -11,6 +12,7 @@ use super::{ActorCritic, Drawn, Teams};
 use crate::environment::{Environment, Lesson, PRIVILEGED, View};
 use crate::methods::normalise::{Frozen, Running};
 use crate::methods::random::{Stream, derive_seed, normal_noise, stream};
+use crate::methods::ranks::{self, Opened, Parcel, Ranks};
 use crate::methods::workers::Workers;
 use crate::tasks::Point;
 
@@ -214,14 +216,19 @@ pub fn collect<C: ActorCritic>(
 ) -> Split {
     let mut scratch: Vec<(C::Scratch, Split)> = (0..workers.threads()).map(|_| Default::default()).collect();
     let RolloutBuffer { trajectories, control, companion } = buffer;
-    let groups = environments.chunks_mut(C::TOGETHER).zip(trajectories.chunks_mut(C::TOGETHER));
-    let decisions = control.chunks_mut(C::TOGETHER).zip(companion.chunks_mut(C::TOGETHER));
+    let own = own_environments::<C>(environments.len(), workers);
+    let groups =
+        environments[own.clone()].chunks_mut(C::TOGETHER).zip(trajectories[own.clone()].chunks_mut(C::TOGETHER));
+    let decisions = control[own.clone()].chunks_mut(C::TOGETHER).zip(companion[own.clone()].chunks_mut(C::TOGETHER));
     workers.for_each(groups.zip(decisions), &mut scratch, |((group, to), (control, companion)), (scratch, split)| {
         let began = Instant::now();
         let physics = run(group, to, control, companion, iteration, scratch);
         split.physics += physics;
         split.inference += began.elapsed().saturating_sub(physics);
     });
+    if let Some(ranks) = workers.ranks() {
+        gather_from_ranks::<C>(environments, buffer, ranks);
+    }
     // In the order of the environments, so that rounding does not depend on the threads.
     for environment in environments {
         let inputs = iteration.policy.inputs();
@@ -235,6 +242,53 @@ pub fn collect<C: ActorCritic>(
         total.inference += split.inference;
     }
     total
+}
+
+/// The environments that run in this process: all of them, or this rank's share of the groups.
+fn own_environments<C: ActorCritic>(all: usize, workers: &Workers) -> Range<usize> {
+    environments_of::<C>(all, |groups| workers.ranks().map_or(0..groups, |ranks| ranks.share(groups)))
+}
+
+fn environments_of<C: ActorCritic>(all: usize, share: impl Fn(usize) -> Range<usize>) -> Range<usize> {
+    let groups = share(all.div_ceil(C::TOGETHER));
+    groups.start * C::TOGETHER..(groups.end * C::TOGETHER).min(all)
+}
+
+/// Hands all ranks what the environments of each went through: afterwards everybody has all of it, but for the environments themselves.
+fn gather_from_ranks<C: ActorCritic>(
+    environments: &mut [RolloutWorker],
+    buffer: &mut RolloutBuffer,
+    ranks: &dyn Ranks,
+) {
+    let all = environments.len();
+    let RolloutBuffer { trajectories, control, companion } = buffer;
+    let mut parcel = Parcel::default();
+    for i in environments_of::<C>(all, |groups| ranks.share(groups)) {
+        parcel.trajectory(&trajectories[i], [&control[i], &companion[i]]);
+        let worker = &environments[i];
+        parcel.list(&[worker.episode]);
+        parcel.list(&worker.actions);
+        parcel.list(&worker.memory);
+        let statistics = worker.observations.numbers().chain(worker.privileged.numbers());
+        let numbers = statistics.chain(worker.returns.numbers()).chain(worker.lesson.numbers());
+        parcel.list(&numbers.collect::<Vec<_>>());
+    }
+    for (rank, bytes) in ranks.all_gather(parcel.bytes()).iter().enumerate().filter(|(rank, _)| *rank != ranks.rank()) {
+        let mut opened = Opened::new(bytes);
+        for i in environments_of::<C>(all, |groups| ranks::share(groups, rank, ranks.count())) {
+            opened.trajectory(&mut trajectories[i], [&mut control[i], &mut companion[i]]);
+            let worker = &mut environments[i];
+            worker.episode = opened.list().first().copied().unwrap_or_default();
+            (worker.actions, worker.memory) = (opened.list(), opened.list());
+            let mut numbers = opened.list::<f64>().into_iter();
+            let inputs = worker.observations.mean().len();
+            let of = |size, numbers: &mut _| Running::from_numbers(size, numbers).unwrap_or_else(|| Running::new(size));
+            worker.observations = of(inputs, &mut numbers);
+            worker.privileged = of(PRIVILEGED, &mut numbers);
+            worker.returns = of(1, &mut numbers);
+            worker.lesson = Lesson::from_numbers(&mut numbers).unwrap_or_default();
+        }
+    }
 }
 
 /// What a policy is told of a group, and what it says.

@@ -10,6 +10,7 @@ pub mod collect;
 pub mod losses;
 pub mod update;
 
+use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
@@ -21,6 +22,7 @@ pub use self::update::{Learner, OnPolicySettings, UpdateStats, Workspace, update
 use super::config::TrainConfig;
 use super::curriculum::{Curriculum, CurriculumConfig};
 use super::normalise::{Frozen, Running};
+use super::ranks::Ranks;
 use super::{Algorithm, EpisodeState, LearnerState, MakeEnvironment, Report, State, Times, TrainedPolicy, checked};
 use crate::environment::{Lesson, Outcome, PRIVILEGED};
 
@@ -411,6 +413,11 @@ impl<C: ActorCritic> Algorithm for OnPolicy<C> {
 
     fn steps_per_iteration(&self) -> u64 {
         (self.settings.environments * self.settings.rollout_steps) as u64
+    }
+
+    fn join_ranks(&mut self, ranks: Arc<dyn Ranks>) -> Result<()> {
+        self.workspace.workers.join_ranks(ranks);
+        Ok(())
     }
 
     fn save(&self) -> State {

@@ -11,6 +11,7 @@ use crate::environment::PRIVILEGED;
 use crate::methods::normalise::{Forgetting, ValueNorm};
 use crate::methods::parameters::{Adam, clip_norm};
 use crate::methods::random::{Stream, stream};
+use crate::methods::ranks::{self, Opened, Parcel, Ranks};
 use crate::methods::workers::Workers;
 
 /// Samples (steps of one environment) that one thread takes at a time.
@@ -388,22 +389,31 @@ fn update_within<C: ActorCritic>(
             };
             let (norm, networks) = (learner.value_norm, &learner.networks);
             let (lengths, by_blocks) = ([learner.actor.len(), of_critic_len], learner.networks.block());
+            let of_all = minibatch.len().div_ceil(CHUNK);
+            let own = workers.ranks().map_or(0..of_all, |ranks| ranks.share(of_all));
             let chunks = minibatch.chunks(CHUNK).zip(actor_sums.iter_mut().zip(critic_sums.iter_mut()));
-            workers.for_each(chunks, scratch, |(chunk, (of_actor, of_critic)), scratch| {
-                of_actor.clear(lengths[0]);
-                of_critic.clear(lengths[1]);
-                let Scratch { batch, networks: scratch, .. } = scratch;
-                for block in chunk.chunks(by_blocks) {
-                    gather((trajectories, decisions), block, valued, weight, |r| norm.normalise(r), batch);
-                    if let Standardise::Minibatch(_) = settings.standardise {
-                        batch.advantages.iter_mut().for_each(|a| *a = (*a - mean) / std);
+            workers.for_each(
+                chunks.skip(own.start).take(own.len()),
+                scratch,
+                |(chunk, (of_actor, of_critic)), scratch| {
+                    of_actor.clear(lengths[0]);
+                    of_critic.clear(lengths[1]);
+                    let Scratch { batch, networks: scratch, .. } = scratch;
+                    for block in chunk.chunks(by_blocks) {
+                        gather((trajectories, decisions), block, valued, weight, |r| norm.normalise(r), batch);
+                        if let Standardise::Minibatch(_) = settings.standardise {
+                            batch.advantages.iter_mut().for_each(|a| *a = (*a - mean) / std);
+                        }
+                        let (actor, critic) =
+                            (with_actor.then_some(&mut *of_actor), with_critic.then_some(&mut *of_critic));
+                        networks.gradient(batch, loss, scratch, actor, critic);
                     }
-                    let (actor, critic) =
-                        (with_actor.then_some(&mut *of_actor), with_critic.then_some(&mut *of_critic));
-                    networks.gradient(batch, loss, scratch, actor, critic);
-                }
-            });
-            let chunks = minibatch.len().div_ceil(CHUNK);
+                },
+            );
+            let chunks = of_all;
+            if let Some(ranks) = workers.ranks() {
+                gather_from_ranks(&mut actor_sums[..chunks], &mut critic_sums[..chunks], ranks);
+            }
             let Learner { networks, actor: parameters, critic: critic_parameters, actor_adam, critic_adam, .. } =
                 &mut *learner;
             let finish = |part, sum: &Gradient, to: &mut Vec<f32>| networks.finish(part, &sum.gradient, loss, to);
@@ -475,6 +485,22 @@ fn update_within<C: ActorCritic>(
 fn shuffle<T>(list: &mut [T], rng: &mut ChaCha8Rng) {
     for i in (1..list.len()).rev() {
         list.swap(i, rng.random_range(0..=i));
+    }
+}
+
+/// Hands all ranks the sums over the chunks of each.
+fn gather_from_ranks(actor: &mut [Gradient], critic: &mut [Gradient], ranks: &dyn Ranks) {
+    let mut parcel = Parcel::default();
+    for i in ranks.share(actor.len()) {
+        parcel.gradient(&actor[i]);
+        parcel.gradient(&critic[i]);
+    }
+    for (rank, bytes) in ranks.all_gather(parcel.bytes()).iter().enumerate().filter(|(rank, _)| *rank != ranks.rank()) {
+        let mut opened = Opened::new(bytes);
+        for i in ranks::share(actor.len(), rank, ranks.count()) {
+            opened.gradient(&mut actor[i]);
+            opened.gradient(&mut critic[i]);
+        }
     }
 }
 
