@@ -123,6 +123,8 @@ pub enum FromModule<'a> {
         deadline: Micros,
         /// How often it has acted ([`Stats::acted`]).
         acted: u32,
+        /// Its number, for its CAN port; 255 if it is off.
+        node: u8,
     },
     /// These were all frames, or as many as there was room for.
     Sent,

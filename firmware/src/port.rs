@@ -13,12 +13,17 @@
 //! - what waited when the CAN controller went bus-off is given up, and again when it comes back.
 //!
 //! The one exception is a stop: it waits as long as it takes. Its count tells receivers whether it still means something. A release does not.
+//!
+//! A module whose software runs wild is shut out by its [`guard`].
 
 use composer_shared::wire::{Frame, Function, StopCommand};
 
 use crate::controller::{BusStatus, Micros};
 
 pub mod element;
+pub mod guard;
+
+use guard::{Admission, Guard};
 
 /// Transmit slots. The FDCAN of an STM32G4 has three, and so have most CAN controllers that have any number.
 pub const SLOTS: usize = 3;
@@ -88,6 +93,8 @@ pub struct Counts {
     pub overflowed: u32,
     /// Times the CAN controller went bus-off.
     pub bus_off: u32,
+    /// Frames that the [`guard`] refused.
+    pub guarded: u32,
 }
 
 /// Counts one more.
@@ -192,19 +199,31 @@ pub struct Sender {
     waiting: [Option<Queued>; WAITING],
     order: u64,
     off: bool,
+    guard: Option<Guard>,
     counts: Counts,
 }
 
 impl Sender {
     /// One of a module with this control period, with nothing to send.
     pub const fn new(period: Micros) -> Self {
-        let counts = Counts { sent: 0, displaced: 0, replaced: 0, stale: 0, crowded: 0, overflowed: 0, bus_off: 0 };
-        Sender { period, slots: [None; SLOTS], waiting: [None; WAITING], order: 0, off: false, counts }
+        let counts =
+            Counts { sent: 0, displaced: 0, replaced: 0, stale: 0, crowded: 0, overflowed: 0, bus_off: 0, guarded: 0 };
+        Sender { period, slots: [None; SLOTS], waiting: [None; WAITING], order: 0, off: false, guard: None, counts }
     }
 
     /// Sets the control period.
     pub fn set_period(&mut self, period: Micros) {
         self.period = period;
+    }
+
+    /// From now on it sends what a module may, with this number if it is known, and no more.
+    pub fn guard(&mut self, node: Option<u8>) {
+        self.guard.get_or_insert(Guard::new(node)).set_node(node);
+    }
+
+    /// Until when its [`guard`] keeps it silent, if it does.
+    pub fn shut_until(&self) -> Option<Micros> {
+        self.guard.as_ref().and_then(Guard::shut_until)
     }
 
     /// What happened so far; receiving is not its business.
@@ -220,6 +239,14 @@ impl Sender {
     /// Takes a frame to send. It goes to a slot with the next [`Sender::poll`].
     #[inline(never)] // The linked image is checked from here on: `tests/tests/image.rs`.
     pub fn push(&mut self, now: Micros, frame: &Frame) {
+        match self.guard.as_mut().map_or(Admission::Admitted, |guard| guard.admit(now, self.period, frame)) {
+            Admission::Admitted => {}
+            Admission::Refused => return count(&mut self.counts.guarded),
+            Admission::Shut => {
+                count(&mut self.counts.guarded);
+                return self.give_up_all();
+            }
+        }
         for loaded in self.slots.iter_mut().flatten() {
             if supersedes(frame, &loaded.queued.frame) {
                 // Counted when it comes back: it may be on the wire.
@@ -284,6 +311,20 @@ impl Sender {
                 Some(loaded) if stop(&loaded.queued) && loaded.obsolete.is_none() => self.keep(loaded.queued),
                 Some(_) => count(&mut self.counts.stale),
                 None => {}
+            }
+        }
+    }
+
+    /// What waits is not sent any more, but for a stop.
+    fn give_up_all(&mut self) {
+        for place in &mut self.waiting {
+            if place.take_if(|queued| !is_stop(&queued.frame)).is_some() {
+                count(&mut self.counts.guarded);
+            }
+        }
+        for loaded in self.slots.iter_mut().flatten() {
+            if !is_stop(&loaded.queued.frame) {
+                loaded.obsolete.get_or_insert(Obsolete::Stale);
             }
         }
     }

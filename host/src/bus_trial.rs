@@ -38,11 +38,23 @@ pub struct BusSettings {
     pub drop: Option<f64>,
     /// Receivers see frames up to this many milliseconds late.
     pub delay: Option<f64>,
+    /// The station has one port only, at the head end: a cable that is cut takes it from the tail.
+    pub one_port: bool,
+    /// Modules that babble get past the guards of their ports: their CAN controllers are broken, not their software.
+    pub no_guard: bool,
 }
 
 impl Default for BusSettings {
     fn default() -> Self {
-        Self { kind: BusKind::Fd, bitrate: None, data_bitrate: None, drop: None, delay: None }
+        Self {
+            kind: BusKind::Fd,
+            bitrate: None,
+            data_bitrate: None,
+            drop: None,
+            delay: None,
+            one_port: false,
+            no_guard: false,
+        }
     }
 }
 
@@ -191,7 +203,8 @@ struct Outcome {
 
 impl BusTrial<'_> {
     fn sil_config(&self, seed: u64) -> SilConfig {
-        let mut sil = SilConfig::new(self.bus.kind);
+        let usual = SilConfig::new(self.bus.kind);
+        let mut sil = SilConfig { ring: !self.bus.one_port, guard: !self.bus.no_guard, ..usual };
         if let Some(nominal) = self.bus.bitrate {
             sil.rates = BitRates { nominal, data: sil.rates.data.max(nominal) };
         }

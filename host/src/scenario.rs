@@ -72,6 +72,12 @@ pub struct Scenario {
     /// Number of modules between the head end of the cable and the station.
     #[serde(default)]
     pub station_behind: usize,
+    /// The station has one port only, at the head end: a cable that is cut takes it from the tail.
+    #[serde(default)]
+    pub one_port: bool,
+    /// Modules that babble get past the guards of their ports.
+    #[serde(default)]
+    pub no_guard: bool,
     /// What the station orders, in order of time.
     #[serde(default)]
     pub command: Vec<Command>,
@@ -373,6 +379,8 @@ impl Ready {
         sil.faults = self.faults.draw(seed, modules);
         sil.seed = seed;
         sil.station_behind = scenario.station_behind;
+        sil.ring = !scenario.one_port;
+        sil.guard = !scenario.no_guard;
         sil.commands.clone_from(&self.commands);
         sil.injected.clone_from(&self.injected);
         let last = scenario.clock.iter().map(|clock| clock.module + 1).max().unwrap_or(0);

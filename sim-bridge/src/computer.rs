@@ -7,7 +7,7 @@ use composer_firmware::torque_off::Interrupt;
 use composer_shared::observation::Sensors;
 use composer_shared::policy::Policy;
 use composer_shared::robot::MAX_MODULES;
-use composer_shared::wire::{Frame, Mode};
+use composer_shared::wire::{Frame, Mode, NOBODY};
 
 use crate::policy_flash::Policies;
 
@@ -47,6 +47,8 @@ pub struct Answer {
     pub outputs: Outputs,
     /// How often the controller has acted.
     pub acted: u32,
+    /// The module's number; 255 if it is off.
+    pub node: u8,
 }
 
 /// What a module is at, for whoever looks on.
@@ -166,8 +168,10 @@ impl Computer for Local<'_> {
     }
 
     fn answer(&mut self) -> Result<Answer, Trouble> {
-        let acted = self.module.controller().map_or(0, |controller| controller.stats().acted);
-        Ok(Answer { outputs: self.outputs, acted })
+        let controller = self.module.controller();
+        let acted = controller.map_or(0, |controller| controller.stats().acted);
+        let node = controller.map_or(NOBODY, |controller| controller.config().node);
+        Ok(Answer { outputs: self.outputs, acted, node })
     }
 
     fn next_frame(&mut self, _room: usize) -> Result<Option<Frame>, Trouble> {

@@ -11,7 +11,7 @@
 //! | `action:K` | the motors of K modules do nothing, from the start (the paper's action corruption) |
 //! | `observation:K` | the sensors of K modules read zero, from the start (the paper's observation corruption) |
 //! | `stuck:K` | the sensors of K modules keep their last reading, from a random time in the first part on |
-//! | `babble:K` or `babble:K/0x0FF` | K modules flood the bus with frames of this identifier, from the start |
+//! | `babble:K` or `babble:K/0x0FF` | K modules flood the bus with frames of this identifier, from the start, as far as the [guard](composer_firmware::port::guard) of their port lets them |
 //! | `cut` or `cut:M` | the cable breaks behind a random module, or behind module M, at a random time in the first part |
 //! | `drop:P` | a receiver loses a frame that it has acknowledged, with probability P |
 //! | `delay:TIME` | a receiver sees each frame up to TIME later (uniform, in order) |

@@ -51,6 +51,7 @@ pub mod port;
 pub mod qemu;
 pub mod remote;
 pub mod replay;
+pub mod ring;
 pub mod sensor_model;
 pub mod sil;
 pub mod slcan;

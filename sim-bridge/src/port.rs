@@ -15,6 +15,8 @@ use crate::bus::Bus;
 use crate::confinement::ErrorState;
 
 const NEVER: u64 = u64::MAX;
+/// Time from one try to the next of software that runs wild, ns; it tries whenever a frame got through, too.
+const BABBLE_NS: u64 = 100_000;
 
 /// The CAN port of a node.
 #[derive(Clone, Debug)]
@@ -27,6 +29,8 @@ pub struct Port {
     received: VecDeque<Frame>,
     overflowed: u32,
     off: bool,
+    /// What the software of the module sends again and again, since it runs wild.
+    babble: Option<Frame>,
     next_ns: u64,
 }
 
@@ -40,8 +44,19 @@ impl Port {
             received: VecDeque::new(),
             overflowed: 0,
             off: false,
+            babble: None,
             next_ns: NEVER,
         }
+    }
+
+    /// It has the [guard](composer_firmware::port::guard) of the board's, for a module with this number.
+    pub fn guard(&mut self, node: u8) {
+        self.sender.guard(Some(node));
+    }
+
+    /// The software of the module sends this frame again and again from now on.
+    pub fn set_babble(&mut self, frame: Option<Frame>) {
+        self.babble = frame;
     }
 
     /// When it has to be polled at the latest, ns; `u64::MAX` if there is nothing to do.
@@ -131,11 +146,18 @@ impl CanPort for Attached<'_> {
             }
             *ready > now
         });
+        if let Some(frame) = &port.babble {
+            sender.push(us, frame);
+        }
         sender.poll(us, &mut Mailboxes { bus, node, mail: &mut port.mail, now });
         let coming = port.coming.iter().map(|(ready, _)| *ready).min().unwrap_or(NEVER);
         // While it is off nothing becomes of what waits.
         let due = sender.due().filter(|_| !off).map_or(NEVER, |due| due.saturating_mul(1000).max(now + 1));
-        port.next_ns = coming.min(due);
+        let again = port.babble.map_or(NEVER, |_| match sender.shut_until() {
+            Some(until) => (until * 1000).max(now + BABBLE_NS),
+            None => now + BABBLE_NS,
+        });
+        port.next_ns = coming.min(due).min(again);
     }
 
     fn status(&self) -> PortStatus {

@@ -75,7 +75,7 @@ impl From<LinkTrouble> for Trouble {
 /// A message that an answer can consist of, without what it borrows.
 enum Reply {
     Frame(Frame),
-    Answer { torque: Option<[f32; AXES]>, motors_enabled: bool, deadline: Micros, acted: u32 },
+    Answer { torque: Option<[f32; AXES]>, motors_enabled: bool, deadline: Micros, acted: u32, node: u8 },
     Sent,
     Status(Box<link::Status>),
     Interrupted(bool),
@@ -189,8 +189,8 @@ impl<L: Line> Remote<L> {
         let message = self.message()?;
         Ok(match link::decode(&message) {
             Ok(FromModule::Frame(Carried(frame))) => Reply::Frame(frame),
-            Ok(FromModule::Answer { torque, motors_enabled, deadline, acted }) => {
-                Reply::Answer { torque, motors_enabled, deadline, acted }
+            Ok(FromModule::Answer { torque, motors_enabled, deadline, acted, node }) => {
+                Reply::Answer { torque, motors_enabled, deadline, acted, node }
             }
             Ok(FromModule::Sent) => Reply::Sent,
             Ok(FromModule::Status(status)) => Reply::Status(Box::new(status)),
@@ -245,10 +245,14 @@ impl<L: Line> Computer for Remote<L> {
         loop {
             match self.reply()? {
                 Reply::Frame(frame) => self.keep(frame, &mut count)?,
-                Reply::Answer { torque, motors_enabled, deadline, acted } => {
+                Reply::Answer { torque, motors_enabled, deadline, acted, node } => {
                     self.torque = torque.unwrap_or(self.torque);
                     self.drained = count < self.asked;
-                    return Ok(Answer { outputs: Outputs { torque: self.torque, motors_enabled, deadline }, acted });
+                    return Ok(Answer {
+                        outputs: Outputs { torque: self.torque, motors_enabled, deadline },
+                        acted,
+                        node,
+                    });
                 }
                 _ => return Err(self.nonsense("it answers something else than it was asked")),
             }

@@ -18,8 +18,8 @@
 //! - With a dead actuator the plant gets no torque, whatever the controller says; with a zeroed sensor the controller reads
 //!   [`Sensors::ZERO`], with a stuck one always the same sample.
 //!
-//! The line is the station, then the modules from the head to the tail (the station elsewhere with [`SilConfig::station_behind`]), then, only
-//! if there are frames to inject, a foreign node, then the nodes that somebody [`Outside`] plays. Without those everything follows from the plant, the policy image and the configuration: the same
+//! The line is the station, then the modules from the head to the tail (the station elsewhere with [`SilConfig::station_behind`]), then the station's second port
+//! ([`SilConfig::ring`]), then, only if there are frames to inject, a foreign node, then the nodes that somebody [`Outside`] plays. Without those everything follows from the plant, the policy image and the configuration: the same
 //! ones give the same run, bit for bit.
 
 mod change;
@@ -40,7 +40,7 @@ use composer_firmware::torque_off::{Interrupt, WITHIN_US};
 use composer_shared::observation::Sensors;
 use composer_shared::policy::Policy;
 use composer_shared::robot::{AXES, MAX_MODULES};
-use composer_shared::wire::{Frame, Function, Mode, StopCommand};
+use composer_shared::wire::{Frame, Function, Mode, STATION, StopCommand};
 
 use crate::bus::{self, Bus, BusConfig, Disturbance, Event};
 use crate::candump;
@@ -48,6 +48,7 @@ use crate::computer::{Computer, InProcess, Launcher, Poll, Trouble};
 use crate::faults::Fault;
 use crate::plant::Plant;
 use crate::port::Port;
+use crate::ring::{Ring, Side};
 use crate::station::Station;
 
 pub use change::{Change, Refusal};
@@ -123,6 +124,13 @@ fn timing_of(config: &SilConfig, policy: &Policy<'_>, modules: usize) -> Timing 
     config.timing.unwrap_or_else(|| Timing::for_policy(policy, config.bus, modules.max(1) as u8))
 }
 
+/// The station's second port.
+struct Far {
+    node: usize,
+    port: Port,
+    ring: Ring,
+}
+
 struct Engine<'c, L: Launcher> {
     config: SilConfig,
     policy: Policy<'c>,
@@ -133,6 +141,9 @@ struct Engine<'c, L: Launcher> {
     telling: VecDeque<Frame>,
     station_port: Port,
     station_node: usize,
+    /// The station's second port, if it has one.
+    far: Option<Far>,
+    foreign_node: usize,
     act_latency_ns: u64,
     modules: Vec<Module<L::Computer>>,
     lost: Vec<Lost>,
@@ -229,7 +240,11 @@ impl<P: ?Sized> Watch<P> for Observed<'_, '_, P> {
 
 impl<'c, L: Launcher> Engine<'c, L> {
     fn new(config: SilConfig, launcher: L, policy: Policy<'c>, count: usize, outside: usize) -> Result<Self, SilError> {
-        let outside_node = count + 1 + usize::from(!config.injected.is_empty());
+        let period = u64::from(timing_of(&config, &policy, count).period_us);
+        let ring = config.station && config.ring;
+        let far = ring.then(|| Far { node: count + 1, port: Port::new(period), ring: Ring::new() });
+        let foreign_node = count + 1 + usize::from(ring);
+        let outside_node = foreign_node + usize::from(!config.injected.is_empty());
         let nodes = outside_node + outside;
         let bus_config = BusConfig { rates: config.rates, automatic_recovery: config.bus_off == BusOffPolicy::Recover };
         let mut changes = Vec::new();
@@ -238,7 +253,6 @@ impl<'c, L: Launcher> Engine<'c, L> {
             changes.extend(scheduled.until_ns.map(|until| (until, false, scheduled.fault)));
         }
         changes.sort_by_key(|change| change.0);
-        let period = u64::from(timing_of(&config, &policy, count).period_us);
         let act_latency_us = config.act_latency_us.map_or(step_us(count as u8), u64::from);
         let mut engine = Engine {
             policy,
@@ -248,6 +262,8 @@ impl<'c, L: Launcher> Engine<'c, L> {
             telling: VecDeque::new(),
             station_port: Port::new(period),
             station_node: config.station_behind.min(count),
+            far,
+            foreign_node,
             modules: Vec::with_capacity(count),
             lost: Vec::new(),
             changes,
@@ -361,10 +377,13 @@ impl<'c, L: Launcher> Engine<'c, L> {
         let change = self.changes.get(self.next_change).map_or(NEVER, |change| change.0);
         let command = self.config.commands.get(self.next_command).map_or(NEVER, |command| command.0);
         let press = self.config.presses.get(self.next_press).map_or(NEVER, |press| press.0);
-        let injected =
-            self.config.injected.get(self.next_injected).filter(|_| self.bus.has_room(self.modules.len() + 1));
+        let injected = self.config.injected.get(self.next_injected).filter(|_| self.bus.has_room(self.foreign_node));
         let injected = injected.map_or(NEVER, |injected| injected.at_ns);
-        let ports = self.modules.iter().fold(self.station_port.next_ns(), |next, state| next.min(state.port.next_ns()));
+        let far = self.far.as_ref().map_or(NEVER, |far| far.port.next_ns());
+        let ports = self
+            .modules
+            .iter()
+            .fold(self.station_port.next_ns().min(far), |next, state| next.min(state.port.next_ns()));
         change.min(command).min(press).min(injected).min(self.next_poll_ns).min(ports).min(self.bus.next_event_ns())
     }
 
@@ -454,7 +473,12 @@ impl<'c, L: Launcher> Engine<'c, L> {
         if state.babble != babble {
             state.babble = babble;
             let frame = babble.and_then(|id| Frame::new(id, self.config.bus == BusKind::Fd, &[0x55; 8]));
-            self.bus.set_babble(now, node, frame);
+            if self.config.guard {
+                state.port.set_babble(frame);
+                self.poll_port(node, now, true);
+            } else {
+                self.bus.set_babble(now, node, frame);
+            }
         }
         Ok(())
     }
@@ -538,7 +562,7 @@ impl<'c, L: Launcher> Engine<'c, L> {
             self.next_command += 1;
             self.order(command, now);
         }
-        let foreign = self.modules.len() + 1;
+        let foreign = self.foreign_node;
         while let Some(injected) = self.config.injected.get(self.next_injected)
             && injected.at_ns <= now
             && self.bus.has_room(foreign)
@@ -616,7 +640,10 @@ impl<'c, L: Launcher> Engine<'c, L> {
         let port = match self.module(node) {
             Some(module) => &mut self.modules[module].port,
             None if node == self.station_node => &mut self.station_port,
-            None => return,
+            None => match &mut self.far {
+                Some(far) if node == far.node => &mut far.port,
+                _ => return,
+            },
         };
         if always || port.next_ns() <= now {
             port.at(&mut self.bus, node, now).poll();
@@ -654,6 +681,7 @@ impl<'c, L: Launcher> Engine<'c, L> {
                         self.act(module, *at_ns)?;
                     }
                 }
+                self.join(frame, *receivers, *transmitters, *late, *at_ns);
                 if !late {
                     // A slot is free again.
                     for node in bus::nodes(*transmitters) {
@@ -679,6 +707,33 @@ impl<'c, L: Launcher> Engine<'c, L> {
             }
         }
         Ok(())
+    }
+
+    /// What one port of the station heard and the other did not, it may repeat there.
+    fn join(&mut self, frame: &Frame, receivers: bus::Nodes, transmitters: bus::Nodes, late: bool, now: u64) {
+        let Some(far) = &mut self.far else { return };
+        let at = |nodes: bus::Nodes, node: usize| nodes >> node & 1 == 1;
+        let sent = if late { 0 } else { transmitters };
+        let sides = [(Side::Near, self.station_node), (Side::Far, far.node)];
+        let [near, tail] = sides.map(|(_, node)| at(receivers | sent, node));
+        let (side, node) = match (near, tail) {
+            (true, true) => return far.ring.hear_both(now),
+            (true, false) => sides[0],
+            (false, true) => sides[1],
+            (false, false) => return,
+        };
+        // What it repeats does not come back; what it says of its own goes to both parts.
+        let own = frame.module() == STATION && side == Side::Near;
+        if at(sent, node) && !own {
+            return;
+        }
+        if far.ring.hear(side, frame, now) {
+            let ready = now + u64::from(self.config.station_latency_us) * 1000;
+            match side {
+                Side::Near => far.port.send_at(frame, ready),
+                Side::Far => self.station_port.send_at(frame, ready),
+            }
+        }
     }
 
     /// Whether a module can be polled. If it computes, it is polled when it is done.
@@ -755,6 +810,9 @@ impl<'c, L: Launcher> Engine<'c, L> {
             Ok(answer) => answer,
             Err(trouble) => return self.lose(module, now, trouble),
         };
+        if self.config.guard {
+            state.port.guard(answer.node);
+        }
         let acted = answer.acted != state.acted;
         if acted {
             state.acted = answer.acted;

@@ -3,6 +3,7 @@
 use composer_shared::observation::Sensors;
 use composer_shared::policy::Policy;
 use composer_shared::robot::AXES;
+use composer_shared::wire::NOBODY;
 
 use super::{BUILD, Carried, FromModule, LinkError, PROTOCOL, Sample, Status, Text, ToModule, Weights};
 use crate::controller::{Controller, FIRMWARE_VERSION};
@@ -71,6 +72,7 @@ fn answer<'a, F: Lasting<'a>>(
                 motors_enabled: outputs.motors_enabled,
                 deadline: outputs.deadline,
                 acted: module.controller().map_or(0, |controller| controller.stats().acted),
+                node: module.controller().map_or(NOBODY, |controller| controller.config().node),
             });
         }
         ToModule::Frames { room } => {

@@ -74,8 +74,15 @@ fn every_message_fits_and_arrives() {
         FromModule::Hello { protocol: u16::MAX, firmware: 255, build: u64::MAX, policy: Some(u16::MAX) },
         FromModule::Refused(&long),
         FromModule::Frame(frame),
-        FromModule::Answer { torque: Some([-1.5, f32::NAN]), motors_enabled: true, deadline: 1, acted: u32::MAX },
+        FromModule::Answer {
+            torque: Some([-1.5, f32::NAN]),
+            motors_enabled: true,
+            deadline: 1,
+            acted: u32::MAX,
+            node: 63,
+        },
         FromModule::Sent,
+        FromModule::Interrupted { off: true },
         FromModule::Status(status),
         FromModule::LastWords(&long),
     ];
@@ -232,6 +239,7 @@ proptest! {
                 motors_enabled: outputs.motors_enabled,
                 deadline: outputs.deadline,
                 acted: direct.stats().acted,
+                node: direct.config().node,
             }));
             prop_assert_eq!(answers(&mut module, Ok(request)), expected);
         }

@@ -64,7 +64,16 @@ fn raw() -> Raw {
             bus: BusStatus::ErrorActive,
             transmit_errors: 17,
             receive_errors: 18,
-            counts: Counts { overflowed: 15, displaced: 1, replaced: 5, stale: 10, crowded: 19, bus_off: 20, sent: 0 },
+            counts: Counts {
+                overflowed: 15,
+                displaced: 1,
+                replaced: 5,
+                stale: 10,
+                crowded: 19,
+                bus_off: 20,
+                sent: 0,
+                guarded: 7,
+            },
         },
     }
 }

@@ -49,13 +49,27 @@ pub struct BusOptions {
     /// Receivers see frames up to this many milliseconds late
     #[arg(long, value_name = "MS")]
     pub delay: Option<f64>,
+    /// The station has one port only, at the head end, and none at the tail end: a cable that is cut takes it from the tail
+    #[arg(long)]
+    pub one_port: bool,
+    /// Modules that babble get past the guards of their ports: their CAN controllers are broken, not their software
+    #[arg(long)]
+    pub no_guard: bool,
 }
 
 impl BusOptions {
     /// The bus that is asked for.
     pub fn settings(&self) -> BusSettings {
         let kind = if self.bus == Bus::Fd { BusKind::Fd } else { BusKind::Classic };
-        BusSettings { kind, bitrate: self.bitrate, data_bitrate: self.data_bitrate, drop: self.drop, delay: self.delay }
+        BusSettings {
+            kind,
+            bitrate: self.bitrate,
+            data_bitrate: self.data_bitrate,
+            drop: self.drop,
+            delay: self.delay,
+            one_port: self.one_port,
+            no_guard: self.no_guard,
+        }
     }
 }
 

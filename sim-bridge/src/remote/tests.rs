@@ -184,7 +184,7 @@ fn a_link_that_fails_says_how() {
     let image = image();
     let policy = Policy::parse(&image).unwrap();
     let good = || hello(Some(&policy));
-    let answer = FromModule::Answer { torque: None, motors_enabled: true, deadline: 7, acted: 0 };
+    let answer = FromModule::Answer { torque: None, motors_enabled: true, deadline: 7, acted: 0, node: 0 };
     let boot = |build| {
         let hello = FromModule::Hello { protocol: PROTOCOL, firmware: 1, build, policy: Some(9) };
         let bytes = link::encode(&hello, &mut [0; MESSAGE_MAX]).to_vec();

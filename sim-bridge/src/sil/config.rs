@@ -91,6 +91,12 @@ pub struct SilConfig {
     pub station: bool,
     /// Number of modules between the head end of the cable and the station: 0 puts it at the head end.
     pub station_behind: usize,
+    /// Whether the station has a second port at the tail end of the cable, and joins the parts of a cable that is cut ([`crate::ring`]). Its first one is at the head
+    /// end then, for a cut anywhere ([`SilConfig::station_behind`] is 0).
+    pub ring: bool,
+    /// Whether the ports of the modules have the guard of the board's ([`composer_firmware::port::guard`]): then a module that babbles is one whose software runs wild.
+    /// Without it, it is one whose CAN controller does.
+    pub guard: bool,
     /// Stops and releases that the station sends, with their times in ns.
     pub commands: Vec<(u64, StopCommand)>,
     /// When the stop input of which module has been open for long enough, with the times in ns, in their order.
@@ -123,6 +129,8 @@ impl SilConfig {
             numbers: Vec::new(),
             station: true,
             station_behind: 0,
+            ring: true,
+            guard: true,
             commands: Vec::new(),
             presses: Vec::new(),
             injected: Vec::new(),

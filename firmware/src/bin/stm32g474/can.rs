@@ -138,6 +138,11 @@ impl Fdcan {
         with_sender(|sender| sender.set_period(period));
     }
 
+    /// From now on it sends only what a module with this number may.
+    pub fn guard(&mut self, node: u8) {
+        with_sender(|sender| sender.guard(Some(node)));
+    }
+
     /// Waits for the next received frame. Cancelling it loses nothing.
     pub async fn received(&mut self) -> Frame {
         QUEUE.receive().await

@@ -108,6 +108,7 @@ async fn main(_spawner: Spawner) -> ! {
     };
     defmt::info!("module {=u8} of {=u8}", page.node, page.modules);
     let mut can = Fdcan::new(p.FDCAN1, p.PA11, p.PA12, page.bus_off);
+    can.guard(page.node);
     let mut policies = Policies::new(&storage);
     let updater = Updater::start(&mut policies, page.keys, |_, slot| flash::policy(slot).is_ok());
     let started = updater.started();

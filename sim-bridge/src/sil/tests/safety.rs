@@ -62,7 +62,7 @@ impl Plant for Fine {
 
 /// How long after `at` all torques of a robot are zero, us; the step of the plant included.
 fn rests_after(modules: usize, at: u64, config: &SilConfig) -> u64 {
-    let mut plant = Fine::new(modules, 12);
+    let mut plant = Fine::new(modules, 20);
     let mut pulled = false;
     let config = SilConfig { limit_ns: at + 20 * MS, ..config.clone() };
     run(&mut plant, &image(), &config, None, &mut |view, plant| {
@@ -137,9 +137,23 @@ fn a_stop_input_relaxes_all_reachable_modules_within_2_ms() {
     }
 }
 
+/// Both parts of a cut cable, from the moment on at which it is cut.
+#[test]
+fn a_stop_reaches_both_parts_of_a_cut_robot_within_2_ms() {
+    for (bus, cut) in (0..7).flat_map(|cut| [(BusKind::Fd, cut), (BusKind::Classic, cut)]) {
+        for after in [0, 5, 30, 60, 200] {
+            let at = 400 * MS + after * MS;
+            let faults = crate::faults::FaultPlan::draw(&format!("cut:{cut}@400ms").parse().unwrap(), 1, 8);
+            let config = SilConfig { faults, commands: vec![(at, StopCommand::Stop)], ..SilConfig::new(bus) };
+            let longest = rests_after(8, at, &config);
+            assert!(longest <= 2000, "{bus:?} {cut} {after}: {longest} us");
+        }
+    }
+}
+
 #[test]
 fn modules_behind_a_cut_stop_when_they_come_back() {
-    let mut config = with_faults(BusKind::Fd, "cut:3@500ms..1500ms", 8);
+    let mut config = SilConfig { ring: false, ..with_faults(BusKind::Fd, "cut:3@500ms..1500ms", 8) };
     config.commands = vec![(1000 * MS, StopCommand::Stop)];
     let mut toy = Toy::new(8, 50);
     simulate(&mut toy, &config);
@@ -199,7 +213,9 @@ fn what_is_blind_relaxes_if_it_is_to_be_as_on_a_board() {
 #[test]
 fn a_part_of_the_robot_that_lost_the_station_relaxes_after_a_while() {
     let mut toy = Toy::new(8, 140);
-    simulate(&mut toy, &with_faults(BusKind::Fd, "cut:3@1s..5s", 8));
+    let mut config = with_faults(BusKind::Fd, "cut:3@1s..5s", 8);
+    config.ring = false;
+    simulate(&mut toy, &config);
     let pulls = |step: usize, module: usize| toy.history[step][module] != [0.0; 2];
     assert!((0..8).all(|module| pulls(290, module)));
     assert!((0..8).all(|module| pulls(350, module) == (module < 4)));
