@@ -52,7 +52,7 @@ use crate::ring::{Ring, Side};
 use crate::station::Station;
 
 pub use change::{Change, Refusal};
-pub use config::{Clock, Injected, SilConfig, SilError};
+pub use config::{Clock, Injected, SilConfig, SilError, cycle_us};
 pub use outside::{Outside, Turn};
 pub use report::{CycleView, Lost, ModuleReport, ModuleView, SilReport};
 pub use simulation::{Simulation, Watch};

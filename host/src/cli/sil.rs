@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
-use composer_firmware::controller::{BusKind, Timing};
+use composer_firmware::controller::BusKind;
 use composer_shared::policy::Policy;
 use composer_sim_bridge::capture::{Capture, Format, Heading};
 use composer_sim_bridge::external_plant::{self, Address};
@@ -18,7 +18,6 @@ use composer_sim_bridge::sil::SilError;
 use super::PolicySource;
 use super::common::{Common, REPLAYED, table, write_replay};
 use crate::bus_trial::{BusReport, BusSettings, BusTrial, Written};
-use crate::env::EnvConfig;
 use crate::external::Elsewhere;
 
 /// Kind of bus, on the command line.
@@ -263,7 +262,6 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         );
     };
     let config = Arc::new(common.environment(&source)?);
-    warn_if_crowded(&arguments.bus, &config);
     let record = if arguments.replay.is_some() { REPLAYED } else { 0 };
     let qemu = arguments.emulation.launcher(image)?;
     let trial = BusTrial {
@@ -351,21 +349,6 @@ fn run_live(trial: &BusTrial<'_>, options: &LiveOptions, written: &Written<'_>) 
 #[cfg(not(unix))]
 fn run_live(_: &BusTrial<'_>, _: &LiveOptions, _: &Written<'_>) -> Result<()> {
     bail!("--live needs pseudo-terminals, which Linux and macOS have");
-}
-
-/// Says so if the frames of a cycle do not fit the control period (at the default bit rates): it still runs, but the tail is never heard.
-fn warn_if_crowded(bus: &BusOptions, config: &EnvConfig) {
-    let kind = if bus.bus == Bus::Fd { BusKind::Fd } else { BusKind::Classic };
-    let modules = config.robot.modules as u8;
-    let needed_ms = f64::from(Timing::bus_time_us(kind, modules, config.task.task().points(modules))) * 1e-3;
-    let period_ms = f64::from(config.control_period) * 1e3;
-    if bus.bitrate.is_none() && needed_ms > period_ms {
-        eprintln!(
-            "note: {} modules need {needed_ms:.0} ms of a {} bus in every {period_ms:.0} ms; those farthest from the head will not be heard",
-            config.robot.modules,
-            if kind == BusKind::Fd { "CAN-FD" } else { "classic CAN" }
-        );
-    }
 }
 
 /// The lines about the bus.

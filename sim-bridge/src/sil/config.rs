@@ -6,12 +6,12 @@ use composer_firmware::controller::{BusKind, BusOffPolicy, ConfigError, Micros, 
 use composer_firmware::safety::Safety;
 use composer_shared::policy::PolicyError;
 use composer_shared::robot::MAX_MODULES;
-use composer_shared::wire::{Frame, StopCommand};
+use composer_shared::wire::{FRAGMENTS, Frame, StopCommand};
 
 use super::NEVER;
 use crate::computer::Trouble;
 use crate::faults::ScheduledFault;
-use crate::frame_bits::BitRates;
+use crate::frame_bits::{BitRates, Format, worst_case};
 
 /// A module's clock against true time.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -146,6 +146,18 @@ impl SilConfig {
     }
 }
 
+/// Time that the frames of a control cycle take at most on a bus of this kind, with the worst bit stuffing, us: SYNC, so many GOAL frames, and STATE and LATENT
+/// of so many modules.
+pub fn cycle_us(bus: BusKind, rates: BitRates, modules: usize, points: usize) -> u64 {
+    let (short, latent) = match bus {
+        BusKind::Fd => (worst_case(Format::FdBrs, 8), worst_case(Format::FdBrs, 64)),
+        BusKind::Classic => (worst_case(Format::Classic, 8), worst_case(Format::Classic, 8)),
+    };
+    let pieces = if bus == BusKind::Fd { 1 } else { FRAGMENTS as u64 };
+    let [short, latent] = [short, latent].map(|length| rates.with_interframe_ns(length));
+    ((1 + points + modules) as u64 * short + modules as u64 * pieces * latent) / 1000
+}
+
 /// Why a run cannot be made.
 #[derive(Debug, thiserror::Error)]
 pub enum SilError {
@@ -167,6 +179,23 @@ pub enum SilError {
         nominal: u32,
         /// Data bit rate, bit/s.
         data: u32,
+    },
+    /// The frames of a control cycle take longer than a module waits for them: those farthest from the head would never be heard.
+    #[error(
+        "{modules} modules do not fit on this bus: the frames of a control cycle take {} ms, and a module waits {} ms for them; {most} modules fit{instead}",
+        .needed_us / 1000, .waited_us / 1000
+    )]
+    Crowded {
+        /// Modules of the robot.
+        modules: usize,
+        /// Modules that fit.
+        most: usize,
+        /// Time of the frames of a cycle, us.
+        needed_us: u64,
+        /// Time after which a module acts on what it has, us ([`Timing::collect_deadline_us`]).
+        waited_us: u64,
+        /// What has more room, if anything has.
+        instead: &'static str,
     },
     /// The plant's step is zero.
     #[error("the plant's step is 0 ns, but must be at least 1")]

@@ -2,11 +2,12 @@
 
 use std::io;
 
+use composer_firmware::controller::BusKind;
 use composer_shared::policy::Policy;
 use composer_shared::robot::MAX_MODULES;
 use composer_shared::wire::Frame;
 
-use super::{Change, CycleView, Engine, Outside, Refusal, SilConfig, SilError, SilReport, Turn};
+use super::{Change, CycleView, Engine, Outside, Refusal, SilConfig, SilError, SilReport, Turn, cycle_us, timing_of};
 use crate::bus::{self, Event};
 use crate::computer::Launcher;
 use crate::frame_bits::BitRates;
@@ -43,6 +44,26 @@ pub struct Simulation<'p, P, L: Launcher> {
     now: u64,
 }
 
+/// Refuses more modules than the bus has room for.
+fn check_room(config: &SilConfig, policy: &Policy<'_>, modules: usize) -> Result<(), SilError> {
+    let room = |modules: usize| {
+        let waited_us = u64::from(timing_of(config, policy, modules).collect_deadline_us);
+        let points = usize::from(policy.task().points(modules as u8));
+        (cycle_us(config.bus, config.rates, modules, points), waited_us)
+    };
+    let fits = |modules: usize| {
+        let (needed, waited) = room(modules);
+        needed <= waited
+    };
+    if fits(modules) {
+        return Ok(());
+    }
+    let most = (1..modules).rev().find(|modules| fits(*modules)).unwrap_or(0);
+    let (needed_us, waited_us) = room(modules);
+    let instead = if config.bus == BusKind::Classic { ", or more on CAN-FD" } else { "" };
+    Err(SilError::Crowded { modules, most, needed_us, waited_us, instead })
+}
+
 impl<'p, P: Plant, L: Launcher> Simulation<'p, P, L> {
     /// A run of `plant` at time 0: all modules have this policy, `launcher` makes their computers.
     ///
@@ -69,6 +90,7 @@ impl<'p, P: Plant, L: Launcher> Simulation<'p, P, L> {
         if !(10_000..=1_000_000).contains(&nominal) || !(nominal..=8_000_000).contains(&data) {
             return Err(SilError::Rates { nominal, data });
         }
+        check_room(&config, &policy, count)?;
         let step_ns = plant.step_ns();
         if step_ns == 0 {
             return Err(SilError::Step);

@@ -580,3 +580,60 @@ proptest::proptest! {
         proptest::prop_assert!((report, history) == go());
     }
 }
+
+/// How long the frames of a control cycle take from the first bit of SYNC to the last LATENT, ms, and how much of that the bus is busy: the worst
+/// cycle of a robot that has come to rest.
+fn cycle_on_the_wire(bus: BusKind, modules: usize) -> (f64, f64) {
+    let config = SilConfig::new(bus);
+    let mut log = Vec::new();
+    run(&mut Toy::new(modules, 20), &image(), &config, Some(&mut log), &mut |_, _| {}).unwrap();
+    let (mut begins, mut busy, mut worst) = (0, 0, (0.0, 0.0));
+    for entry in candump::parse(&String::from_utf8(log).unwrap()).unwrap() {
+        let at_ns = entry.at_us * 1000;
+        let took = config.rates.ns(crate::frame_bits::length(&entry.frame));
+        let full = config.rates.with_interframe_ns(crate::frame_bits::length(&entry.frame));
+        match entry.frame.function() {
+            Some(Function::Sync) => (begins, busy) = (at_ns.saturating_sub(took), full),
+            Some(Function::Latent | Function::LatentFragment) => {
+                busy += full;
+                let span = (at_ns - begins) as f64 * 1e-6;
+                if begins > 500 * MS && span > worst.0 {
+                    worst = (span, busy as f64 * 1e-6);
+                }
+            }
+            _ => busy += full,
+        }
+    }
+    worst
+}
+
+/// The modules keep the wire busy: with 64 of them a cycle takes what its frames take, and hardly more.
+#[test]
+fn sixty_four_modules_on_can_fd_are_within_5_per_cent_of_the_wire() {
+    let (span, busy) = cycle_on_the_wire(BusKind::Fd, 64);
+    println!("{span:.2} ms, of which the bus is busy {busy:.2} ms");
+    assert!(span < 1.05 * busy && span < 15.4, "{span} ms, of which the bus is busy {busy} ms");
+    let mut toy = Toy::new(64, 40);
+    let (report, seen) = simulate(&mut toy, &SilConfig::new(BusKind::Fd));
+    assert!(seen[4..].iter().all(|seen| seen.heard.iter().all(|heard| *heard == u64::MAX)));
+    assert!(report.modules.iter().all(|module| module.stats.acted == 40 && module.longest_gap_ms < 55.0));
+}
+
+/// On a classic bus the latents of 32 modules come in time; those of more would not, so they are refused.
+#[test]
+fn classic_can_has_room_for_32_modules_and_refuses_more() {
+    let mut toy = Toy::new(32, 40);
+    let (report, seen) = simulate(&mut toy, &SilConfig::new(BusKind::Classic));
+    assert!(seen[4..].iter().all(|seen| seen.heard.iter().all(|heard| *heard == 0xffff_ffff)));
+    assert!(report.modules.iter().all(|module| module.stats.acted == 40 && module.longest_gap_ms < 55.0));
+    let refused = |modules, config: &SilConfig| {
+        run(&mut Toy::new(modules, 5), &image(), config, None, &mut |_, _| {}).unwrap_err().to_string()
+    };
+    let classic = refused(33, &SilConfig::new(BusKind::Classic));
+    assert!(
+        classic.contains("33 modules do not fit") && classic.contains("32 modules fit, or more on CAN-FD"),
+        "{classic}"
+    );
+    let slow = SilConfig { rates: BitRates { nominal: 125_000, data: 250_000 }, ..SilConfig::new(BusKind::Fd) };
+    assert!(refused(64, &slow).contains("64 modules do not fit on this bus"), "{}", refused(64, &slow));
+}
