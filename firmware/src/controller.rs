@@ -63,6 +63,7 @@ pub use crate::boot::{Boot, ResetCause, Retained};
 use crate::conflict::Conflict;
 use crate::failsafe::Failsafe;
 pub use crate::failsafe::{BusOffPolicy, BusStatus, Fault, FaultSet, LimitedBy};
+use crate::motor_health::MotorHealth;
 use crate::neighbours::{Heard, Neighbours, bit};
 use crate::power::{Power, PowerWatch};
 use crate::safety::Safety;
@@ -465,6 +466,7 @@ pub struct Controller<'a> {
     /// Beside the mode in HEARTBEAT.
     remark: u8,
     sample: Sensors,
+    motors: MotorHealth,
     /// Of the policy: empty at power-up, and where the robot begins to move.
     memory: Memory,
     encoded: Option<Encoded>,
@@ -526,6 +528,7 @@ impl<'a> Controller<'a> {
             power: Power::default(),
             remark: 0,
             sample: Sensors::ZERO,
+            motors: MotorHealth::default(),
             memory: Memory::EMPTY,
             encoded: None,
             points: policy
@@ -880,11 +883,12 @@ impl<'a> Controller<'a> {
 
     fn health(&self) -> Health {
         let faults = self.faults();
+        let [yaw_dead, pitch_dead] = self.motors.work().map(|works| !works);
         let flags = [
             (Health::SENSORS_PLAUSIBLE, self.sample.plausible()),
-            (Health::MOTORS_ENABLED, self.enabled),
+            (Health::YAW_DEAD, yaw_dead),
             (Health::EMERGENCY_STOP, faults.contains(Fault::EmergencyStop)),
-            (Health::FAULT, !faults.is_empty()),
+            (Health::PITCH_DEAD, pitch_dead),
         ];
         let health =
             flags.into_iter().fold(Health(0), |health, (flag, set)| if set { health.with(flag) } else { health });
@@ -1136,6 +1140,8 @@ impl<'a> Controller<'a> {
         self.encoded = None;
         self.sample = *sensors;
         self.failsafe.check_sample(sensors);
+        self.motors.update(self.commanded(), sensors, self.limits.joint_speed);
+        self.failsafe.set(Fault::MotorDead, self.motors.work() != [true; AXES]);
         self.neighbours.start(low);
         self.failsafe.set(Fault::PolicyMismatch, self.neighbours.mismatch() != 0);
         self.failsafe.set(Fault::ProtocolVersion, self.neighbours.foreign_protocol() != 0);
@@ -1163,6 +1169,11 @@ impl<'a> Controller<'a> {
         if cycle.wrapping_add(u16::from(self.config.node)) % REPORT_EVERY == 0 {
             self.outbox.telemetry = Some(self.telemetry());
         }
+    }
+
+    /// The torque commanded now, of the policy's limit.
+    fn commanded(&self) -> [f32; AXES] {
+        self.torque.map(|torque| torque / self.limits.torque)
     }
 
     /// Whether this module is told the goal.
@@ -1218,7 +1229,12 @@ impl<'a> Controller<'a> {
             seeker: self.policy.task().seeker(),
         };
         let place = place(self.own(), usize::from(self.config.modules));
-        let motors = Motors { commanded: self.torque.map(|torque| torque / self.limits.torque), ..Motors::SOUND };
+        let node = self.config.node;
+        let motors = Motors {
+            commanded: self.commanded(),
+            work: self.motors.work(),
+            beside: [node.checked_sub(1), Some(node.saturating_add(1))].map(|module| self.neighbours.motors(module)),
+        };
         let observation = observe(&self.sample, &motors, place, &head, &told);
         let encoded = self.policy.encode(&mut self.memory, &observation);
         if self.policy.attention() && !self.quiet {

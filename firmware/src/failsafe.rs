@@ -48,6 +48,7 @@
 //! | 47 StationLost | an armed module hearing nothing from the station for [`Safety::dead_man_ms`] |
 //! | 48 ModuleCount | the time-keeper's SYNC with another number of modules |
 //! | 49 ProtocolVersion | a neighbour's HEARTBEAT with another version |
+//! | 50 MotorDead | measured torque that contradicts the command ([`crate::motor_health`]) |
 //!
 //! A *limit* ([`LimitedBy`], numbers from 96) says that all is well but the policy does not get all the torque it asks for.
 

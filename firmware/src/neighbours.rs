@@ -7,6 +7,8 @@ use composer_shared::policy::Latent;
 use composer_shared::robot::ROOM;
 use composer_shared::wire::{FRAGMENTS, Fragment, Health, LatentMessage, PROTOCOL_VERSION, State, WireError};
 
+use crate::motor_health::share;
+
 /// What a frame brought.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Heard {
@@ -89,7 +91,8 @@ impl Neighbours {
             silence: Silence::NONE,
             silence_state: Silence::NONE,
             silence_latent: Silence::NONE,
-            states: [State::new(0, Health(0), &[0.0; 4]); ROOM],
+            // Before it was heard a neighbour counts as well.
+            states: [State::new(0, Health::SENSORS_PLAUSIBLE, &[0.0; 4]); ROOM],
             latents: [Latent::default(); ROOM],
             assemblies: [Assembly { data: [[0; 7]; FRAGMENTS], pieces: 0, cycle4: 0 }; ROOM],
         }
@@ -263,6 +266,14 @@ impl Neighbours {
         state.health.sensors_plausible().then_some(*state)
     }
 
+    /// Share of the motors of `module` that work, by its last STATE: 0 if it is silent or blind, and 1 for a module that the robot does not have.
+    pub fn motors(&self, module: Option<u8>) -> f32 {
+        let Some(module) = module.filter(|module| *module < self.modules) else { return 1.0 };
+        let state = self.states.get(usize::from(module)).filter(|_| self.alive() & bit(module) != 0);
+        let state = state.filter(|state| state.health.sensors_plausible());
+        state.map_or(0.0, |state| share(state.health.motors_work()))
+    }
+
     /// Whether somebody is already in the next cycle.
     pub fn next_cycle_seen(&self) -> bool {
         self.state_next | self.latent_next != 0
@@ -375,6 +386,20 @@ mod tests {
         assert_eq!(neighbours.state(2), None);
         neighbours.hear_latent(2, &latent(9));
         assert_eq!((neighbours.usable(), neighbours.mismatch()), (0b0100, 0));
+    }
+
+    #[test]
+    fn the_motors_of_a_neighbour_are_those_of_its_last_state() {
+        let mut neighbours = started(0);
+        assert_eq!([None, Some(4), Some(0), Some(2)].map(|module| neighbours.motors(module)), [1.0; 4]);
+        neighbours.hear_state(0, State::new(0, Health::SENSORS_PLAUSIBLE.with(Health::YAW_DEAD), &[0.5; 4]));
+        neighbours.hear_state(2, State::new(0, Health(0), &[0.5; 4]));
+        assert_eq!([0, 2, 3].map(|module| neighbours.motors(Some(module))), [0.5, 0.0, 1.0]);
+        // Two lost frames change nothing; with the third it counts as gone.
+        for (cycle, share) in [(1, 0.5), (2, 0.5), (3, 0.5), (4, 0.0)] {
+            neighbours.start(cycle);
+            assert_eq!(neighbours.motors(Some(0)), share, "{cycle}");
+        }
     }
 
     #[test]

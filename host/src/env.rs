@@ -7,11 +7,11 @@
 use std::sync::Arc;
 
 use composer_firmware::controller::relax_factor;
-use composer_firmware::motor_health::MotorHealth;
+use composer_firmware::motor_health::{MotorHealth, share};
 use composer_shared::kinematics::Chain;
 use composer_shared::observation::{self, Motors, POINTS, Sensors, Told};
 use composer_shared::policy::{GoalKnownTo, Task};
-use composer_shared::robot::{AXES, Limits};
+use composer_shared::robot::Limits;
 use composer_shared::wire;
 use composer_sim_bridge::faults::{Fault, FaultKind, FaultPlan, ScheduledFault};
 use composer_sim_bridge::sensor_model::SensorModel;
@@ -338,7 +338,7 @@ impl SnakeEnv {
             chains: [Chain::new(config.robot.geometry()), Chain::new(config.robot.geometry())],
             sensors: vec![Sensors::ZERO; modules],
             command: vec![[0.0; 2]; modules],
-            health: vec![MotorHealth::new(); modules],
+            health: vec![MotorHealth::default(); modules],
             speaking: [0; 2],
             heard: vec![0; modules],
             delay: 1,
@@ -363,7 +363,7 @@ impl SnakeEnv {
         self.delay = self.rng.random_range(config.delay[0]..=config.delay[1]).min(config.substeps() - 1);
         self.chains = [Chain::new(config.robot.geometry()), Chain::new(config.robot.geometry())];
         self.command.fill([0.0; 2]);
-        self.health.fill(MotorHealth::new());
+        self.health.fill(MotorHealth::default());
         self.episode_return = 0.0;
         self.sample();
     }
@@ -378,7 +378,7 @@ impl SnakeEnv {
         let working = |other: Option<usize>| match other {
             None => 1.0,
             Some(other) if self.speaking[self.now.side(module)] >> other & 1 == 0 => 0.0,
-            Some(other) => self.health[other].work().iter().filter(|works| **works).count() as f32 / AXES as f32,
+            Some(other) => share(self.health[other].work()),
         };
         let behind = Some(module + 1).filter(|other| *other < self.modules());
         Motors {
@@ -400,10 +400,10 @@ impl SnakeEnv {
             self.sensors[module] = if self.now.blind & bit != 0 { Sensors::ZERO } else { self.snake.sensors(module) };
             let speaks = self.now.gone & bit == 0 && self.sensors[module].plausible();
             if self.now.gone & bit != 0 {
-                self.health[module] = MotorHealth::new();
+                self.health[module] = MotorHealth::default();
             } else if speaks {
                 let commanded = self.commanded(module);
-                self.health[module].update(commanded, self.sensors[module].torque);
+                self.health[module].update(commanded, &self.sensors[module], self.limits.joint_speed);
             }
             let angles = self.sensors[module].joint_angles.map(wire::quantise_angle);
             for (side, chain) in self.chains.iter_mut().enumerate() {
@@ -839,5 +839,52 @@ mod tests {
         assert!(!env.step(&still).truncated && !env.step(&still).truncated);
         let last = env.step(&still);
         assert!(last.truncated && !last.terminated && (last.distance - 17.5).abs() < 7.6);
+    }
+
+    /// The shipped policies on robots of the lab: no motor that works is called dead, and one that is dead is found soon after it is asked for torque.
+    #[test]
+    fn sound_motors_raise_no_alarm_on_any_robot_of_the_lab_and_dead_ones_are_found() {
+        let (mut sound, mut late) = (0, Vec::new());
+        for task in Task::ALL {
+            let image = composer_shared::policies::shipped(task.name()).unwrap();
+            let policy = composer_shared::policy::Policy::parse(image).unwrap();
+            let vary = Variation::from_toml(crate::vary::LAB).unwrap();
+            let config = Arc::new(EnvConfig { vary, delay: [1, 3], ..EnvConfig::new(task, Robot::default()) });
+            let mut env = SnakeEnv::new(config.clone());
+            for seed in 0..20 {
+                let dead = (seed % 2 == 1).then_some(seed as usize / 2 % 8);
+                let fault = |module| ScheduledFault { at_ns: 0, until_ns: None, fault: Fault::ActuatorDead(module) };
+                let faults: Vec<_> = dead.map(fault).into_iter().collect();
+                let (mut asked, mut found) = ([0; 2], [None; 2]);
+                crate::eval::run_episode(&mut env, &policy, seed, &faults, |env, _| {
+                    for module in 0..8 {
+                        let work = env.health[module].work();
+                        if dead != Some(module) {
+                            assert_eq!(work, [true; 2], "{task}, seed {seed}, module {module}");
+                            sound += 2;
+                            continue;
+                        }
+                        let commanded = env.commanded(module);
+                        for axis in 0..2 {
+                            asked[axis] += usize::from(commanded[axis].abs() > 0.2);
+                            if !work[axis] && found[axis].is_none() {
+                                found[axis] = Some(asked[axis]);
+                            }
+                            assert!(work[axis] || found[axis].is_some());
+                        }
+                    }
+                });
+                // A motor that is hardly ever asked for anything is not missed.
+                let steps = |axis: usize| found[axis].or((asked[axis] > 40).then_some(usize::MAX));
+                late.extend(dead.iter().flat_map(|_| (0..2).filter_map(steps)));
+            }
+        }
+        late.sort_unstable();
+        let (median, last) = (late[late.len() / 2], late[late.len() * 19 / 20]);
+        println!(
+            "{sound} motor steps without an alarm; {} dead motors: asked {median} steps in the median, 95 % at most {last}",
+            late.len()
+        );
+        assert!(late.len() > 50 && median <= 6 && last <= 15, "{late:?}");
     }
 }

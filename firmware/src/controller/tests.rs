@@ -10,6 +10,8 @@ use composer_shared::policy::{IMAGE_SIZE, Shape, Task, random_image, random_imag
 use composer_shared::wire::{ALL_MODULES, Function};
 use proptest::prelude::*;
 
+use crate::motor_health::share;
+
 use super::*;
 
 mod arming;
@@ -71,6 +73,8 @@ struct Net {
     nodes: Vec<Option<Controller<'static>>>,
     outputs: Vec<Outputs>,
     sensors: Vec<Sensors>,
+    /// Motors that give nothing; the others give what they are told.
+    dead: Vec<[bool; AXES]>,
     status: Vec<BusStatus>,
     mailbox: Vec<Option<Frame>>,
     /// What modules keep to that are plugged in from now on.
@@ -97,6 +101,7 @@ impl Net {
             nodes: vec![None; n],
             outputs: vec![Outputs { torque: [0.0; 2], motors_enabled: false, deadline: 0 }; n],
             sensors: vec![level(); n],
+            dead: vec![[false; AXES]; n],
             status: vec![BusStatus::ErrorActive; n],
             mailbox: vec![None; n],
             safety: Safety::POLICY,
@@ -150,7 +155,12 @@ impl Net {
 
     fn poll(&mut self, node: usize, frame: Option<&Frame>) {
         if let Some(controller) = &mut self.nodes[node] {
-            let outputs = controller.poll(self.now, &self.sensors[node], frame, self.status[node]);
+            let (mut sensors, plausible) = (self.sensors[node], self.sensors[node].plausible());
+            for (axis, torque) in sensors.torque.iter_mut().enumerate().filter(|_| plausible) {
+                let given = controller.torque()[axis] / self.policy.limits().torque;
+                *torque = if self.dead[node][axis] { 0.0 } else { given };
+            }
+            let outputs = controller.poll(self.now, &sensors, frame, self.status[node]);
             assert!(outputs.deadline > self.now);
             assert!(outputs.torque.iter().all(|t| t.abs() <= self.policy.limits().torque));
             assert!(outputs.motors_enabled || outputs.torque == [0.0; 2]);
@@ -292,6 +302,7 @@ fn eight_modules_agree_from_power_up() {
 
 #[test]
 fn the_torques_are_those_of_the_training_loop_to_the_last_bit() {
+    let mut died = false;
     for (bus, policy) in [
         (BusKind::Fd, policy(7, &[])),
         (BusKind::Classic, policy(7, &[])),
@@ -306,7 +317,7 @@ fn the_torques_are_those_of_the_training_loop_to_the_last_bit() {
         net.plug(2);
         let mut chain = Chain::new(policy.geometry());
         let mut torques = [[0.0f32; 2]; 5];
-        let mut memories = [Memory::EMPTY; 5];
+        let (mut memories, mut health) = ([Memory::EMPTY; 5], [MotorHealth::default(); 5]);
         let relax = relax_factor(50_000, policy.relax_seconds());
         for cycle in 0..30 {
             let started = net.at(3).stats().cycles;
@@ -316,6 +327,11 @@ fn the_torques_are_those_of_the_training_loop_to_the_last_bit() {
                 sensors.joint_speeds = core::array::from_fn(|j| libm::cosf(x * j as f32));
                 sensors.angular_rate = [libm::sinf(3.0 * x), 0.1, -0.2];
                 sensors.torque = torques[i].map(|t| t / policy.limits().torque);
+                // The yaw motor of module 3 dies on the way.
+                net.dead[3][0] = cycle > 10;
+                if i == 3 && cycle > 10 {
+                    sensors.torque[0] = 0.0;
+                }
             }
             // Module 2's accelerometer dies on the way.
             net.sensors[2].up = if cycle > 15 { [0.0; 3] } else { [0.0, 0.0, 1.0] };
@@ -326,6 +342,8 @@ fn the_torques_are_those_of_the_training_loop_to_the_last_bit() {
             net.run(PERIOD / 2);
 
             for (i, sensors) in net.sensors.iter().enumerate() {
+                let commanded = torques[i].map(|torque| torque / policy.limits().torque);
+                health[i].update(commanded, sensors, policy.limits().joint_speed);
                 match sensors.plausible() {
                     true => chain.hear(i, &sensors.joint_angles.map(quantise_angle)),
                     false => chain.miss(i, relax),
@@ -336,7 +354,13 @@ fn the_torques_are_those_of_the_training_loop_to_the_last_bit() {
                 let points = policy.task().observed(i as u8, 5).map(|number| number.and_then(point));
                 let told = Told { points, seeker: policy.task().seeker() };
                 let commanded = torques[i].map(|torque| torque / policy.limits().torque);
-                let motors = Motors { commanded, ..Motors::SOUND };
+                let beside = |j: Option<usize>| match j.filter(|j| *j < 5) {
+                    Some(j) if !net.sensors[j].plausible() => 0.0,
+                    Some(j) => share(health[j].work()),
+                    None => 1.0,
+                };
+                let beside = [beside(i.checked_sub(1)), beside(Some(i + 1))];
+                let motors = Motors { commanded, work: health[i].work(), beside };
                 let head = chain.head_seen_from(i);
                 policy.encode(&mut memories[i], &observe(&net.sensors[i], &motors, place(i, 5), &head, &told))
             });
@@ -356,7 +380,9 @@ fn the_torques_are_those_of_the_training_loop_to_the_last_bit() {
             }
         }
         assert!(torques.iter().flatten().any(|t| t.abs() > 1.0), "the test policy does nothing");
+        died |= !health[3].work()[0];
     }
+    assert!(died, "nobody found the dead motor");
 }
 
 #[test]
@@ -724,6 +750,8 @@ fn a_goal_for_the_head_alone_moves_the_others_only_through_attention() {
     let torques = |policy: Policy<'static>, goal| {
         let mut net = Net::new(3, BusKind::Fd, policy);
         net.goal = Some(goal);
+        // What a module does comes back to it as torque, and is nobody's word.
+        net.dead.fill([true; AXES]);
         net.run(300_000);
         (net.at(0).encoded, net.at(1).encoded)
     };
@@ -908,7 +936,7 @@ fn faults_are_told_at_once() {
     let (_, frame) = net.sent(Function::Heartbeat).filter(|(_, f)| f.module() == 6).last().unwrap();
     let Ok(Message::Heartbeat(heartbeat)) = Message::parse(frame) else { panic!() };
     assert_eq!((heartbeat.fault, heartbeat.mode), (37, Mode::Relaxed as u8));
-    assert!(heartbeat.health.has(Health::FAULT) && !heartbeat.health.motors_enabled());
+    assert_eq!(heartbeat.health.motors_work(), [true, true]);
 }
 
 // Configuration
@@ -1115,5 +1143,40 @@ proptest! {
         prop_assert!(net.live().all(|n| n.heard() == 0x3f));
         prop_assert!(net.live().zip(misses).all(|(n, before)| n.stats().deadline_misses == before));
         prop_assert!(net.outputs.iter().all(|o| o.motors_enabled));
+    }
+}
+
+// Motors
+
+/// A motor dies, is found, told in STATE, HEARTBEAT and to the neighbours, and works again.
+#[test]
+fn a_dead_motor_is_found_and_told() {
+    let mut net = Net::eight();
+    let follow = |net: &mut Net, dead: bool| {
+        for _ in 0..40 {
+            net.dead[4][1] = dead;
+            for i in 0..8 {
+                // Something to do: targets that go round.
+                net.sensors[i].joint_angles = [libm::sinf((net.now / PERIOD) as f32 * 0.3 + i as f32); 4];
+            }
+            net.run(PERIOD);
+        }
+    };
+    let last_state = |net: &Net| {
+        let (_, frame) = net.sent(Function::State).filter(|(_, f)| f.module() == 4).last().unwrap();
+        let Ok(Message::State(state)) = Message::parse(frame) else { panic!() };
+        state.health.motors_work()
+    };
+    net.run(SECOND);
+    for dead in [false, true, false] {
+        follow(&mut net, dead);
+        assert_eq!(last_state(&net), [true, !dead]);
+        assert_eq!(net.at(4).faults().number(), if dead { 50 } else { 0 });
+        assert_eq!(net.at(4).mode(), Mode::Active, "it goes on");
+        let beside = |i: usize, j| net.at(i).neighbours.motors(Some(j));
+        assert_eq!(
+            [beside(3, 4), beside(5, 4), beside(4, 3)],
+            [if dead { 0.5 } else { 1.0 }, if dead { 0.5 } else { 1.0 }, 1.0]
+        );
     }
 }

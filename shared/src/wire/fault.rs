@@ -64,6 +64,8 @@ pub enum Fault {
     ModuleCount = 48,
     /// A neighbour speaks another version of this protocol.
     ProtocolVersion = 49,
+    /// A motor does not give the torque that it is told; which one STATE says.
+    MotorDead = 50,
 }
 
 /// What a fault does to the motors.
@@ -115,7 +117,7 @@ pub enum Clearing {
 
 impl Fault {
     /// All of them.
-    pub const ALL: [Fault; 18] = [
+    pub const ALL: [Fault; 19] = [
         Fault::EmergencyStop,
         Fault::Watchdog,
         Fault::SyncLost,
@@ -134,6 +136,7 @@ impl Fault {
         Fault::StationLost,
         Fault::ModuleCount,
         Fault::ProtocolVersion,
+        Fault::MotorDead,
     ];
 
     /// The fault with this number.
@@ -185,6 +188,7 @@ impl Fault {
             Fault::StationLost => (Effect::Disarmed, false, Itself, "the next frame from the station"),
             Fault::ModuleCount => (Effect::On, true, Itself, "the neighbour agreeing, or falling silent"),
             Fault::ProtocolVersion => (Effect::On, true, Itself, "the neighbour agreeing, or falling silent"),
+            Fault::MotorDead => (Effect::On, false, Itself, "the motor giving what it is told for some cycles"),
         }
     }
 }

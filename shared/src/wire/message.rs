@@ -37,12 +37,12 @@ pub struct Health(pub u8);
 impl Health {
     /// Bit 0: the module's sensors read something that can be true. If not, its angles and its latent are to be ignored.
     pub const SENSORS_PLAUSIBLE: Health = Health(1);
-    /// Bit 1: its motors follow the policy; if not, they are relaxed.
-    pub const MOTORS_ENABLED: Health = Health(2);
+    /// Bit 1: its yaw motor does not give the torque that it is told.
+    pub const YAW_DEAD: Health = Health(2);
     /// Bit 2: its emergency stop is latched.
     pub const EMERGENCY_STOP: Health = Health(4);
-    /// Bit 3: a numbered fault is active, see its HEARTBEAT.
-    pub const FAULT: Health = Health(8);
+    /// Bit 3: its pitch motor does not give the torque that it is told.
+    pub const PITCH_DEAD: Health = Health(8);
 
     /// Both.
     #[must_use]
@@ -60,9 +60,9 @@ impl Health {
         self.has(Health::SENSORS_PLAUSIBLE)
     }
 
-    /// Whether the motors follow the policy, see [`Health::MOTORS_ENABLED`].
-    pub const fn motors_enabled(self) -> bool {
-        self.has(Health::MOTORS_ENABLED)
+    /// Which motors work, yaw and pitch, see [`Health::YAW_DEAD`] and [`Health::PITCH_DEAD`].
+    pub const fn motors_work(self) -> [bool; AXES] {
+        [!self.has(Health::YAW_DEAD), !self.has(Health::PITCH_DEAD)]
     }
 
     /// The same with the stop count in bits 4 to 7.

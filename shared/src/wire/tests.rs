@@ -23,7 +23,7 @@ fn frame(text: &str, fd: bool) -> Frame {
 fn latent() -> LatentMessage {
     let mut key = core::array::from_fn(|i| i as i8);
     (key[0], key[1], key[2]) = (127, -128, 1);
-    LatentMessage { cycle: 0x34, health: Health(3), policy: 0x1234, key, value: core::array::from_fn(|i| -(i as i8)) }
+    LatentMessage { cycle: 0x34, health: Health(1), policy: 0x1234, key, value: core::array::from_fn(|i| -(i as i8)) }
 }
 
 fn chunk() -> ChunkRepr {
@@ -40,11 +40,15 @@ fn examples() -> Vec<(Message, u8, &'static str)> {
         (Message::Sync(Sync::new(0x1234, 7, 8)), 0, "080#34120708"),
         (Message::Goal(Goal::new(0x34, 2, Some([0.5, 1.5, -0.25]))), STATION, "17F#340580008001C0FF"),
         (
-            Message::State(State::new(0x34, Health(3), &[lsb, -lsb, -2048.0 * lsb, -16.0 * lsb])),
+            Message::State(State::new(
+                0x34,
+                Health(1).with(Health::PITCH_DEAD),
+                &[lsb, -lsb, -2048.0 * lsb, -16.0 * lsb]
+            )),
             3,
-            "183#340301F0FF0008FF"
+            "183#340901F0FF0008FF"
         ),
-        (Message::LatentFragment(latent().fragments()[0]), 3, "283#04340334127F8001"),
+        (Message::LatentFragment(latent().fragments()[0]), 3, "283#04340134127F8001"),
         (
             Message::ServiceRequest(ServiceRequest {
                 destination: ALL_MODULES,
@@ -106,7 +110,7 @@ fn examples() -> Vec<(Message, u8, &'static str)> {
             Message::Heartbeat(Heartbeat {
                 mode: Mode::Relaxed as u8 | Heartbeat::LAB,
                 fault: Fault::SyncLost as u8,
-                health: Health::SENSORS_PLAUSIBLE.with(Health::FAULT),
+                health: Health::SENSORS_PLAUSIBLE.with(Health::PITCH_DEAD),
                 time_keeper: 0,
                 protocol: PROTOCOL_VERSION,
                 firmware: 1,
@@ -333,7 +337,7 @@ fn the_table_finds_the_fields_where_the_structs_put_them() {
 
 #[test]
 fn a_health_carries_the_last_stop_or_release() {
-    let health = Health::FAULT.with(Health::EMERGENCY_STOP).with_stop_count(StopCount::new(11));
+    let health = Health::PITCH_DEAD.with(Health::EMERGENCY_STOP).with_stop_count(StopCount::new(11));
     assert_eq!(health, Health(0xbc));
     assert_eq!(health.stop_count().number(), 11);
     assert!(health.has(Health::EMERGENCY_STOP) && !health.sensors_plausible());

@@ -286,7 +286,7 @@ async fn refuse(flashes: u8, can: Option<(&mut Fdcan, u8)>, light: &mut Output<'
         let heartbeat = Heartbeat {
             mode: Mode::Boot as u8,
             fault: Fault::PolicyMismatch as u8,
-            health: Health::FAULT,
+            health: Health(0),
             time_keeper: NOBODY,
             protocol: PROTOCOL_VERSION,
             firmware: FIRMWARE_VERSION,

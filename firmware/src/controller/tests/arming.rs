@@ -571,7 +571,8 @@ fn the_watchdog_latches_before_the_hardware_resets_the_chip() {
     module.arm(false).unwrap();
     let mut now = 0;
     while now < SECOND {
-        now = module.poll(now, &level(), None, BusStatus::ErrorActive).deadline;
+        let torque = module.torque().map(|torque| torque / policy.limits().torque);
+        now = module.poll(now, &Sensors { torque, ..level() }, None, BusStatus::ErrorActive).deadline;
     }
     assert!(module.faults().is_empty());
     // Just before the hardware bites.
