@@ -25,7 +25,7 @@ use composer_shared::kinematics::Chain;
 use composer_shared::nn::Dense;
 use composer_shared::observation::{Motors, Seeker, Sensors, Told, observe};
 use composer_shared::policies;
-use composer_shared::policy::{Latent, Memory, Policy};
+use composer_shared::policy::{IMAGE_SIZE, Latent, Memory, OBS, Policy, Shape, random_image_of};
 use composer_shared::registers::Register;
 use composer_shared::robot::{Geometry, MAX_MODULES};
 use composer_shared::sha512::Sha512;
@@ -113,6 +113,7 @@ fn sensors(random: &mut Random) -> Sensors {
 }
 
 /// The parts of a control step by themselves.
+#[inline(never)]
 fn parts(policy: &Policy<'_>, random: &mut Random) {
     let mut chain = Chain::new(Geometry::default());
     for module in 0..MAX_MODULES {
@@ -216,6 +217,7 @@ impl Board for Bench {
 }
 
 /// The service: with a frame that is not for it, and with a request.
+#[inline(never)]
 fn service(policy: Policy<'_>, random: &mut Random) {
     let Ok(mut controller) = Controller::new(Config::new(3, 8, BusKind::Fd, &policy), policy, Boot::default(), 0)
     else {
@@ -284,7 +286,8 @@ fn update() {
 }
 
 /// Whole control steps of the last module among `modules`, fed with the frames of all others and of the station.
-fn control_steps(policy: Policy<'_>, modules: u8, random: &mut Random) {
+#[inline(never)]
+fn control_steps(name: &str, policy: Policy<'_>, modules: u8, random: &mut Random) {
     let node = modules - 1;
     let config = Config::new(node, modules, BusKind::Fd, &policy);
     let period = config.timing.period_us;
@@ -330,8 +333,21 @@ fn control_steps(policy: Policy<'_>, modules: u8, random: &mut Random) {
         hprintln!("the controller among {} modules did not take part in every cycle: {:?}", modules, stats);
         debug::exit(debug::EXIT_FAILURE);
     }
-    report(format_args!("control_step/{modules}/mean"), (sum / u64::from(CYCLES - JOINING)) as u32);
-    report(format_args!("control_step/{modules}/max"), most);
+    report(format_args!("{name}/{modules}/mean"), (sum / u64::from(CYCLES - JOINING)) as u32);
+    report(format_args!("{name}/{modules}/max"), most);
+}
+
+/// The same of a network that has all there is; its weights do not matter. It lies in RAM only here.
+#[inline(never)]
+fn control_steps_with_memory(random: &mut Random) {
+    let mut image = [0; IMAGE_SIZE];
+    random_image_of(Shape::FULL, 1, &mut image);
+    let Ok(policy) = Policy::parse(&image) else { return };
+    let (mut memory, observation) = (Memory::EMPTY, [0.5; OBS]);
+    report(format_args!("encode_memory"), count(|| policy.encode(&mut memory, black_box(&observation))));
+    for modules in [8, 16, 32, 64] {
+        control_steps("control_step_memory", policy, modules, random);
+    }
 }
 
 /// What a board does with a frame.
@@ -360,8 +376,9 @@ fn main() -> ! {
             service(policy, &mut random);
             update();
             for modules in [8, 16, 32, 64] {
-                control_steps(policy, modules, &mut random);
+                control_steps("control_step", policy, modules, &mut random);
             }
+            control_steps_with_memory(&mut random);
             debug::exit(debug::EXIT_SUCCESS);
         }
         _ => hprintln!("the shipped policy is not valid"),
