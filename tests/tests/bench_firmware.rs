@@ -6,7 +6,7 @@ mod arm;
 mod common;
 
 use common::{json, refuse, succeed};
-use composer_firmware::budget::step_instructions;
+use composer_firmware::budget::{MEMORY_INSTRUCTIONS, step_instructions};
 
 #[test]
 fn the_kernels_are_as_fast_as_promised() {
@@ -21,6 +21,11 @@ fn the_kernels_are_as_fast_as_promised() {
     for modules in [8, 16, 32, 64] {
         let (longest, budget) = (count(&format!("control_step/{modules}/max")), f64::from(step_instructions(modules)));
         assert!((0.8 * budget..=budget).contains(&longest), "{modules} modules: {longest} of {budget} instructions");
+        // With a memory, a bias by distance and the whole observation.
+        let (longest, budget) =
+            (count(&format!("control_step_memory/{modules}/max")), budget + f64::from(MEMORY_INSTRUCTIONS));
+        assert!((0.8 * budget..=budget).contains(&longest), "{modules} modules: {longest} of {budget} instructions");
+        assert!(modules > 8 || longest <= 90_000.0, "{longest}");
     }
     let table = succeed(folder.path(), &["bench", "firmware", "--image", image]);
     for line in ["attention over 64 modules", "with the DSP extension", "framing, LATENT parsed", "1.5 cycles/insn"] {

@@ -7,7 +7,7 @@ use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
-use composer_firmware::budget::{CLOCK_HZ, CYCLES_PER_100_INSTRUCTIONS, step_instructions};
+use composer_firmware::budget::{CLOCK_HZ, CYCLES_PER_100_INSTRUCTIONS, MEMORY_INSTRUCTIONS, step_instructions};
 use composer_sim_bridge::qemu::{PROGRAM, QemuError};
 
 /// What it emulates, and how it counts.
@@ -107,6 +107,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     part("attitude filter, one update", "attitude")?;
     part("observation", "observation")?;
     part("encode", "encode")?;
+    part("encode, with a memory and the whole observation", "encode_memory")?;
     for modules in [8, 16, 32, 64] {
         part(&format!("attention over {modules} modules"), &format!("attention/{modules}"))?;
     }
@@ -133,12 +134,17 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let cycles = f64::from(CYCLES_PER_100_INSTRUCTIONS) / 100.0;
     let most = format!("{cycles} cycles/insn");
     println!("{:>8} {:>10} {:>10} {:>14} {most:>16} {:>12}", "modules", "mean", "longest", "1 cycle/insn", "may take");
-    for modules in [8, 16, 32, 64] {
-        let mean = count(&format!("control_step/{modules}/mean"))?;
-        let longest = count(&format!("control_step/{modules}/max"))?;
-        let ms = longest as f64 * 1e3 / f64::from(CLOCK_HZ);
-        let budget = step_instructions(modules);
-        println!("{modules:>8} {mean:>10} {longest:>10} {ms:>14.2} {:>16.2} {budget:>12}", cycles * ms);
+    for (name, more) in [("control_step", 0), ("control_step_memory", MEMORY_INSTRUCTIONS)] {
+        if more > 0 {
+            println!("the same with a memory, a bias by distance and the whole observation");
+        }
+        for modules in [8, 16, 32, 64] {
+            let mean = count(&format!("{name}/{modules}/mean"))?;
+            let longest = count(&format!("{name}/{modules}/max"))?;
+            let ms = longest as f64 * 1e3 / f64::from(CLOCK_HZ);
+            let budget = step_instructions(modules) + more;
+            println!("{modules:>8} {mean:>10} {longest:>10} {ms:>14.2} {:>16.2} {budget:>12}", cycles * ms);
+        }
     }
     println!("\na controller is {} bytes, whatever the number of modules", count("controller_bytes")?);
     Ok(())
