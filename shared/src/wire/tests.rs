@@ -142,7 +142,7 @@ fn every_message_has_exactly_the_documented_bytes() {
 fn a_latent_fills_one_fd_frame() {
     let emitted = Message::Latent(latent()).emit(7, false);
     assert_eq!((emitted.id, emitted.fd, emitted.len), (0x207, true, 64));
-    assert_eq!(emitted.data[..8], [0x34, 3, 0x34, 0x12, 127, 0x80, 1, 3]);
+    assert_eq!(emitted.data[..8], [0x34, 1, 0x34, 0x12, 127, 0x80, 1, 3]);
     assert_eq!((emitted.data[20], emitted.data[51], emitted.data[52]), (0, -31i8 as u8, 0));
     assert_eq!(Message::parse(&emitted), Ok(Message::Latent(latent())));
 
