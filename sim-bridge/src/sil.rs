@@ -253,7 +253,6 @@ impl<'c, L: Launcher> Engine<'c, L> {
             changes.extend(scheduled.until_ns.map(|until| (until, false, scheduled.fault)));
         }
         changes.sort_by_key(|change| change.0);
-        let period = u64::from(timing_of(&config, &policy, count).period_us);
         let act_latency_us = config.act_latency_us.map_or(step_us(count as u8, policy.shape().memory > 0), u64::from);
         let mut engine = Engine {
             policy,
