@@ -31,7 +31,7 @@ use crate::vary::Variation;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct FaultTraining {
-    /// Share of episodes with a fault.
+    /// Share of episodes with a fault. Higher: more practice with faults, less without.
     pub probability: f32,
     /// Most modules hit in one episode. Higher: episodes that are harder, some of them beyond what the body can do. The number is drawn evenly from 1 to
     /// this; if `mixed`, 1 is drawn twice as often as 2 and three times as often as 3.
@@ -45,7 +45,8 @@ pub struct FaultTraining {
     pub latest: f32,
     /// Faults that every episode has besides, written as on the command line, such as `action:#3@0s`: for a specialist that knows its fault. Empty: none.
     pub fixed: String,
-    /// Share of a module's latents that its neighbours miss, drawn anew each step (frames lost or late).
+    /// Share of a module's latents that its neighbours miss, drawn anew each step (frames lost or late). Higher:
+    /// relies less on what others say.
     pub missed_latents: f32,
 }
 

@@ -59,7 +59,8 @@ pub struct EnvSettings {
     /// Physics steps from sampling the sensors to the new torque, least and most, drawn for each episode: a bus delays by one
     /// or two.
     pub delay: [usize; 2],
-    /// Lengths to train on, in modules; environments take them in turn. Empty: the robot's own.
+    /// Lengths to train on, in modules; environments take them in turn, so that a length that stands here twice is trained on twice as often. Longer ones
+    /// cost more time a step. Empty: the robot's own.
     pub lengths: Vec<usize>,
 }
 

@@ -36,7 +36,7 @@ pub struct TrainConfig {
     pub total_steps: u64,
     /// Environments side by side.
     pub environments: usize,
-    /// Steps each takes in an iteration.
+    /// Steps each takes in an iteration. Higher: rewards that come later are seen before the critic is asked, gradients are less noisy, updates fewer.
     pub rollout_steps: usize,
     /// Minibatches an epoch.
     pub minibatches: usize,
@@ -46,7 +46,7 @@ pub struct TrainConfig {
     pub critic_epochs: usize,
     /// Discount per control step, 0 to 1. Higher looks further ahead and learns slower.
     pub gamma: f64,
-    /// Decay of generalised advantage estimation, 0 to 1.
+    /// Decay of generalised advantage estimation, 0 to 1. Higher: trusts the critic less, and is noisier.
     pub lambda: f64,
     /// Ratios of new to old density count up to 1 +- this.
     pub clip: f64,
@@ -58,6 +58,7 @@ pub struct TrainConfig {
     pub learning_rate_end: f64,
     /// KL divergence an update of the actor should come to. Above 0 the learning rate of each policy is divided by 1.5 after an iteration
     /// whose last minibatch was beyond twice that, multiplied by 1.5 if it was below half of it, and stays between 1e-5 and 1e-2.
+    /// Higher: learns in larger steps for as long as the run goes on, and ends noisier.
     pub kl_target: f64,
     /// Adam's epsilon.
     pub adam_epsilon: f64,
@@ -69,7 +70,8 @@ pub struct TrainConfig {
     pub entropy: f64,
     /// Standard deviation of the actions at the start, as a fraction of the torque limit.
     pub sigma: f64,
-    /// Least standard deviation of an action, as a fraction of the torque limit (for the imagination policy: of its bound); 0 for none.
+    /// Least standard deviation of an action, as a fraction of the torque limit (for the imagination policy: of its bound); 0 for none. Higher: goes on
+    /// trying other ways, and learns for motors that do not quite what they are told.
     pub sigma_min: f64,
     /// What computes the gradients: `manual` (written by hand, fast) or `automatic` (burn's autodiff, the reference).
     pub gradient: Differentiation,

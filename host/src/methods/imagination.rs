@@ -21,6 +21,8 @@
 //! Measured (`snakectl report ablation`, README): it learns to point straight at the goal within some 50,000 steps, which a snake cannot
 //! follow and which the `progress` reward says too; at `follow` 0.1 it makes no difference, at 1 and above learning is slower.
 //!
+//! Settings for variants that may do better stand in [`ImaginationConfig`]; [`crate::study`] compares them (`snakectl report imagination`).
+//!
 //! A dead module neither imagines (it stays where it is) nor is asked to follow.
 
 use anyhow::{Result, bail};
