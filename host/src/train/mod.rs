@@ -388,7 +388,7 @@ mod tests {
     }
 
     #[test]
-    fn a_curriculum_and_a_second_stage_go_on_bit_for_bit_whatever_the_threads() {
+    fn a_curriculum_a_second_stage_and_what_modules_remember_go_on_bit_for_bit_whatever_the_threads() {
         use crate::env::{EnvConfig, FaultTraining, SnakeEnv};
         use crate::methods::curriculum::{CurriculumConfig, SecondStage};
         let make: MakeEnvironment = &|index| {
@@ -403,6 +403,9 @@ mod tests {
             total_steps: 6 * 96,
             curriculum: CurriculumConfig { ramp_steps: 200, failure_share: 0.5, varied: 0.6, ..Default::default() },
             second: SecondStage { from: 4 * 96, learning_rate: 1e-3, faults: 1.1, varied: 0.9 },
+            inputs: composer_shared::observation::SIZE,
+            memory: composer_shared::policy::MEMORY,
+            distance_bias: true,
             ..small(Method::ComposerNoImagination)
         };
         let mut straight = Trainer::new(&TrainConfig { threads: 2, ..config.clone() }, make, "snake").unwrap();
@@ -417,6 +420,8 @@ mod tests {
             let folder = tempfile::tempdir().unwrap();
             first.checkpoint().unwrap().write(folder.path()).unwrap();
             let checkpoint = Checkpoint::read(folder.path()).unwrap();
+            // In the middle of episodes, so that there is something to remember.
+            assert!(checkpoint.state.episodes.iter().any(|episode| !episode.actions.is_empty()));
             let mut second = Trainer::resume(&checkpoint, &config, make, "snake").unwrap();
             (cut..6).for_each(|_| drop(second.iterate().unwrap()));
             assert_eq!(second.checkpoint().unwrap().state, straight.checkpoint().unwrap().state, "cut at {cut}");
