@@ -1,5 +1,6 @@
 //! Sets of episodes with complete controllers, each with the frozen policy, on a simulated CAN bus.
 
+use std::cell::RefCell;
 use std::io;
 use std::sync::Arc;
 use std::time::Instant;
@@ -21,6 +22,7 @@ use serde::Serialize;
 use crate::env::EnvConfig;
 use crate::eval::{episode_seed, parallel};
 use crate::external::Elsewhere;
+use crate::mcap::Recording;
 use crate::outcome::{Episode, Report};
 use crate::recorder::Recorder;
 use crate::sil::SnakePlant;
@@ -159,6 +161,8 @@ pub struct Written<'w> {
     pub episodes: usize,
     /// The frames on the bus, and what the modules were told and answered.
     pub capture: Option<Capture<'w>>,
+    /// All that there is to see.
+    pub recording: Option<RefCell<Recording>>,
 }
 
 /// Everybody who looks at an episode.
@@ -167,22 +171,35 @@ struct Watching<'a, 'w> {
     recorder: &'a mut Option<Recorder>,
 }
 
+impl Watching<'_, '_> {
+    /// The episode begins.
+    fn begin(&self, plant: &SnakePlant) -> io::Result<()> {
+        let Some(written) = self.written else { return Ok(()) };
+        if let Some(capture) = &written.capture {
+            capture.begin_run();
+        }
+        written.recording.as_ref().map_or(Ok(()), |recording| recording.borrow_mut().begin_episode(plant))
+    }
+}
+
 impl Watch<SnakePlant> for Watching<'_, '_> {
     fn frame(&mut self, at_ns: u64, piece: usize, frame: &Frame) -> io::Result<()> {
-        match self.written.and_then(|written| written.capture.as_ref()) {
-            Some(mut capture) => Watch::<SnakePlant>::frame(&mut capture, at_ns, piece, frame),
-            None => Ok(()),
+        let Some(written) = self.written else { return Ok(()) };
+        if let Some(mut capture) = written.capture.as_ref() {
+            Watch::<SnakePlant>::frame(&mut capture, at_ns, piece, frame)?;
         }
+        written.recording.as_ref().map_or(Ok(()), |recording| recording.borrow_mut().frame(at_ns, piece, frame))
     }
 
     fn cycle(&mut self, view: &CycleView<'_>, plant: &SnakePlant) -> io::Result<()> {
         if let Some(recorder) = self.recorder {
             recorder.cycle(view, plant);
         }
-        match self.written.and_then(|written| written.capture.as_ref()) {
-            Some(mut capture) => capture.cycle(view, plant),
-            None => Ok(()),
+        let Some(written) = self.written else { return Ok(()) };
+        if let Some(mut capture) = written.capture.as_ref() {
+            capture.cycle(view, plant)?;
         }
+        written.recording.as_ref().map_or(Ok(()), |recording| recording.borrow_mut().cycle(view, plant))
     }
 }
 
@@ -293,12 +310,10 @@ impl BusTrial<'_> {
         outside: Option<&mut dyn Outside>,
         mut watching: Watching<'_, '_>,
     ) -> Result<SilReport, sil::SilError> {
+        watching.begin(plant).map_err(sil::SilError::Capture)?;
         match watching.written.and_then(|written| written.capture.as_ref()) {
             None => sil::run_watched(launcher, plant, policy, sil, outside, &mut watching),
-            Some(capture) => {
-                capture.begin_run();
-                sil::run_watched(&capture.recording(launcher), plant, policy, sil, outside, &mut watching)
-            }
+            Some(capture) => sil::run_watched(&capture.recording(launcher), plant, policy, sil, outside, &mut watching),
         }
     }
 

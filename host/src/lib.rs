@@ -12,6 +12,7 @@ pub mod external;
 pub mod files;
 pub mod flash;
 pub mod freeze;
+pub mod mcap;
 pub mod methods;
 pub mod mjcf;
 pub mod network;

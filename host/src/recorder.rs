@@ -33,7 +33,7 @@ pub fn recording(config: &EnvConfig, title: &str, policy: &str) -> Recording {
 }
 
 /// What the page shows of a course.
-fn setting(task: &TaskConfig, course: &Course, link_radius: f32) -> Setting {
+pub(crate) fn setting(task: &TaskConfig, course: &Course, link_radius: f32) -> Setting {
     let rules = task.rules();
     let shape = |outline, pose, look| Shape { outline, pose, look, moves: false, label: String::new() };
     let look = if task.task() == Task::TubeCrossing { Look::Glass } else { Look::Solid };
@@ -77,7 +77,6 @@ fn setting(task: &TaskConfig, course: &Course, link_radius: f32) -> Setting {
 pub struct Recorder {
     episode: Episode,
     task: TaskConfig,
-    faults: Vec<ScheduledFault>,
     time_keeper: Option<u8>,
 }
 
@@ -92,7 +91,6 @@ impl Recorder {
         let mut recorder = Recorder {
             episode: Episode::new(name, setting(task, judge.course(), snake.robot().link_radius)),
             task: task.clone(),
-            faults: faults.to_vec(),
             time_keeper: None,
         };
         for scheduled in faults {
@@ -121,31 +119,10 @@ impl Recorder {
         });
     }
 
-    fn status(&self, module: usize, view: &ModuleView, now_ns: u64) -> Status {
-        if !view.plugged {
-            return Status::Unplugged;
-        }
-        let hit = |wanted: fn(&Fault) -> Option<usize>| {
-            self.faults.iter().any(|f| f.active(now_ns) && wanted(&f.fault) == Some(module))
-        };
-        if hit(|f| if let Fault::ActuatorDead(m) = f { Some(*m) } else { None }) {
-            Status::ActuatorDead
-        } else if hit(|f| match f {
-            Fault::SensorZeroed(m) | Fault::SensorStuck(m) => Some(*m),
-            _ => None,
-        }) {
-            Status::SensorFault
-        } else if matches!(view.mode, Mode::Active | Mode::Alone) {
-            Status::Ok
-        } else {
-            Status::Relaxed
-        }
-    }
-
     /// The end of a control cycle.
     pub fn cycle(&mut self, cycle: &CycleView<'_>, plant: &SnakePlant) {
         let modules = cycle.modules.len();
-        let status = (0..modules).map(|m| self.status(m, &cycle.modules[m], cycle.at_ns)).collect();
+        let status = (0..modules).map(|m| module_status(m, &cycle.modules[m], cycle.faults)).collect();
         let weights: Vec<f32> = cycle
             .modules
             .iter()
@@ -178,6 +155,26 @@ impl Recorder {
         self.episode.note("result", if result.success { words.done } else { words.missed });
         self.episode.note("control steps", result.steps.to_string());
         self.episode.note("distance at the end", format!("{:.2} units", result.distance));
+    }
+}
+
+/// What a module is able to do, with these faults active.
+pub(crate) fn module_status(module: usize, view: &ModuleView, faults: &[Fault]) -> Status {
+    if !view.plugged {
+        return Status::Unplugged;
+    }
+    let hit = |wanted: fn(&Fault) -> Option<usize>| faults.iter().any(|fault| wanted(fault) == Some(module));
+    if hit(|f| if let Fault::ActuatorDead(m) = f { Some(*m) } else { None }) {
+        Status::ActuatorDead
+    } else if hit(|f| match f {
+        Fault::SensorZeroed(m) | Fault::SensorStuck(m) => Some(*m),
+        _ => None,
+    }) {
+        Status::SensorFault
+    } else if matches!(view.mode, Mode::Active | Mode::Alone) {
+        Status::Ok
+    } else {
+        Status::Relaxed
     }
 }
 

@@ -91,6 +91,9 @@ pub struct Scenario {
     pub expect: Expectations,
 }
 
+/// Most frames that one line injects.
+const MOST_INJECTED: usize = 100_000;
+
 fn one() -> usize {
     1
 }
@@ -288,7 +291,11 @@ impl Scenario {
                 }
                 None => 0,
             };
-            injected.extend((0..foreign.times as u64).map(|k| Injected { at_ns: at + k * every, frame }));
+            if !(1..=MOST_INJECTED).contains(&foreign.times) {
+                bail!("inject.times = {} cannot be: 1 to {MOST_INJECTED} frames are possible", foreign.times);
+            }
+            let after = |k: u64| at.saturating_add(every.saturating_mul(k));
+            injected.extend((0..foreign.times as u64).map(|k| Injected { at_ns: after(k), frame }));
         }
         injected.sort_by_key(|injected| injected.at_ns);
         if scenario.task.is_none() && scenario.policy.is_none() {
@@ -671,6 +678,13 @@ mod tests {
             (with("episodes = 0", "success_rate = 0.5"), "tests nothing"),
             (with("", "latent_age = \"20\""), "is not a time"),
             (with("[[inject]]\nat = \"1s\"\nframe = \"zz\"", "success_rate = 0.5"), "inject.frame = \"zz\""),
+            (
+                with(
+                    "[[inject]]\nat = \"1s\"\nframe = \"123#\"\ntimes = 4000000000\nevery = \"1ms\"",
+                    "success_rate = 0.5",
+                ),
+                "inject.times = 4000000000 cannot be: 1 to 100000 frames",
+            ),
             (with("[[clock]]\nmodule = 1\nppm = 1e9", "success_rate = 0.5"), "clock"),
             ("about = \"x\"\n[expect]\nsuccess_rate = 0.5".into(), "neither task nor policy"),
             ("about = \"x\"\ntask = \"dancing\"\n[expect]\nsuccess_rate = 0.5".into(), "no task `dancing`"),

@@ -4,13 +4,18 @@
 use std::sync::Arc;
 
 use composer_shared::observation::Sensors;
+use composer_shared::policies;
+use composer_shared::policy::{Policy, Task};
 use composer_shared::robot::AXES;
 use composer_sim_bridge::Plant;
+use composer_sim_bridge::computer::InProcess;
 use composer_sim_bridge::external_plant::PlantError;
+use composer_sim_bridge::sil::{SilConfig, Simulation};
 
 use crate::env::EnvConfig;
 use crate::external::{Elsewhere, External};
 use crate::outcome::Episode;
+use crate::robot::Robot;
 use crate::sim::Snake;
 use crate::tasks::{Judge, Point};
 
@@ -27,6 +32,43 @@ pub struct SnakePlant {
     /// The same of every physics step so far, module by module, if it is kept.
     trace: Option<Vec<[u32; AXES]>>,
     endless: bool,
+}
+
+/// A robot of so many modules with the policy that ships for a task, at the start of the episode with this seed, on a simulated bus that is set up like this.
+///
+/// ```
+/// use composer_firmware::controller::BusKind;
+/// use composer_host::sil::shipped;
+/// use composer_shared::policy::Task;
+/// use composer_sim_bridge::faults::Fault;
+/// use composer_sim_bridge::sil::{Change, SilConfig};
+///
+/// # fn main() -> anyhow::Result<()> {
+/// let mut robot = shipped(Task::GoalReaching, 8, 5, SilConfig::new(BusKind::Fd))?;
+/// robot.advance_cycles(10)?;
+/// robot.change(Change::Begin(Fault::Unplug(3), None))??;
+/// robot.advance_cycles(4)?;
+/// assert!(robot.look(|seen| seen.modules.iter().all(|module| module.alive >> 3 & 1 == 0))?);
+/// robot.advance(60_000_000_000)?;
+/// assert!(robot.plant().judge().verdict().distance < 4.0 && robot.report()?.deadline_misses < 50);
+/// # Ok(())
+/// # }
+/// ```
+///
+/// # Errors
+///
+/// If there cannot be such a robot.
+pub fn shipped(
+    task: Task,
+    modules: usize,
+    seed: u64,
+    sil: SilConfig,
+) -> anyhow::Result<Simulation<'static, SnakePlant, InProcess<'static>>> {
+    let image = policies::shipped(task.name()).ok_or_else(|| anyhow::anyhow!("no policy ships for {task}"))?;
+    let policy = Policy::parse(image).map_err(|error| anyhow::anyhow!("{error}"))?;
+    let robot = Robot::default().with_modules(modules)?;
+    let plant = SnakePlant::new(Arc::new(EnvConfig::new(task, robot)), seed);
+    Ok(Simulation::new(InProcess::new(policy), plant, policy, sil)?)
 }
 
 impl SnakePlant {

@@ -3,6 +3,7 @@
 mod common;
 
 use std::path::Path;
+use std::process::Command;
 
 use common::{command, json, refuse, snakectl, succeed};
 
@@ -81,26 +82,112 @@ fn another_policy_is_told_apart_and_a_capture_that_was_cut_off_is_used_as_far_as
     assert!(!folder.path().join("bus.pcap").exists());
 }
 
+fn python(folder: &Path, script: &str, arguments: &[&str]) -> serde_json::Value {
+    // The test lies in target/release/deps.
+    let test = std::env::current_exe().unwrap();
+    let python = test.ancestors().nth(3).unwrap().join("can-tools/bin/python");
+    assert!(python.exists(), "{} is missing: tests/run installs it", python.display());
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("python").join(script);
+    let output = Command::new(python).current_dir(folder).arg(script).args(arguments).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+#[test]
+fn python_can_cantools_mcap_and_foxgloves_schemas_open_what_a_run_leaves_behind() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    std::fs::write(path.join("robot.dbc"), succeed(path, &["dbc"])).unwrap();
+    let more = ["--capture", "bus.log", "--record", "run.mcap", "--capture-episodes", "3"];
+    succeed(path, &[&SIL[..], &more, &["--fault", "unplug:#3@0.2s..0.6s,action:#5"]].concat());
+    let seen = python(path, "look_back.py", &["robot.dbc", "bus.log", "run.mcap", "8", "32"]);
+    let count = |topic: &str| seen["counts"][topic].as_u64().unwrap();
+    let cycles = count("/modules");
+    assert!(cycles > 3 * 10 && count("/bus") > cycles * 16, "{seen}");
+    for topic in ["/joints", "/torques", "/attention"] {
+        assert_eq!(count(topic), cycles, "{topic}");
+    }
+    // And once at the start of each of three episodes.
+    assert_eq!(count("/tf"), cycles + 3);
+    // At the start, armed or not, unplugged, plugged in, active: at least four looks an episode.
+    assert!(seen["scenes"].as_u64().unwrap() >= 3 * 4, "{seen}");
+    let faults = seen["faults"].as_array().unwrap();
+    let of_an_episode = [
+        serde_json::json!(["module 5's motors dead"]),
+        serde_json::json!(["module 5's motors dead", "module 3 unplugged"]),
+        serde_json::json!(["module 5's motors dead"]),
+    ];
+    assert_eq!(faults[..3], of_an_episode, "{seen}");
+    assert_eq!(seen["schemas"], 21);
+    assert!(
+        (seen["attention"].as_f64().unwrap() - 1.0).abs() < 0.01 && seen["moved"].as_f64().unwrap() > 1.0,
+        "{seen}"
+    );
+    assert!(seen["heard"]["LATENT"].as_u64().unwrap() > 7 * cycles / 2, "{seen}");
+}
+
+#[test]
+fn wireshark_reads_our_pcap_and_sees_which_frames_are_can_fd() {
+    let folder = tempfile::tempdir().unwrap();
+    for (bus, fd) in [("fd", true), ("classic", false)] {
+        let (pcap, log) = (format!("{bus}.pcap"), format!("{bus}.log"));
+        for file in [&pcap, &log] {
+            succeed(
+                folder.path(),
+                &["sil", "goal-reaching", "--episodes", "1", "--seed", "3", "--bus", bus, "--capture", file],
+            );
+        }
+        let mut tshark = Command::new("tshark");
+        let fields = ["can.id", "canfd.flags.brs", "can.flags.rtr", "data.data", "frame.time_epoch"];
+        tshark
+            .current_dir(folder.path())
+            .args(["-r", &pcap, "-T", "fields"])
+            .args(fields.iter().flat_map(|f| ["-e", f]));
+        let output = tshark.output().expect("tests/run installs tshark");
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let text = String::from_utf8(output.stdout).unwrap();
+        let written = std::fs::read_to_string(folder.path().join(&log)).unwrap();
+        let log = composer_sim_bridge::candump::parse(&written).unwrap();
+        assert_eq!(text.lines().count(), log.len());
+        for (line, entry) in text.lines().zip(log) {
+            let fields: Vec<&str> = line.split('\t').collect();
+            assert_eq!(fields[0], entry.frame.id.to_string(), "{line}");
+            // It shows the flag of bit-rate switching for CAN-FD alone, that of remote frames for classic CAN alone.
+            assert_eq!(fields[1..3], if fd { ["1", ""] } else { ["", "0"] }, "{line}");
+            let data: String = entry.frame.payload().iter().map(|byte| format!("{byte:02x}")).collect();
+            assert_eq!(fields[3], data, "{line}");
+            let (seconds, rest) = fields[4].split_once('.').unwrap();
+            let us = 1_000_000 * seconds.parse::<u64>().unwrap() + rest[..6].parse::<u64>().unwrap();
+            assert_eq!(us, entry.at_us, "{line}");
+        }
+    }
+}
+
 #[cfg(unix)]
 #[test]
 fn a_disk_that_fills_up_ends_the_run_with_what_there_was() {
     let folder = tempfile::tempdir().unwrap();
-    for (file, least) in [("bus.log", 40_000), ("bus.pcap", 40_000)] {
+    let files =
+        [("--capture", "bus.log", 260_000), ("--capture", "bus.pcap", 260_000), ("--record", "run.mcap", 100_000)];
+    for (option, file, least) in files {
         let program = command(folder.path(), &[]).get_program().to_owned();
         // The system refuses to make a file longer than this, in blocks of 512 bytes, as a full disk would.
-        let script = format!(
-            "trap '' XFSZ; ulimit -f 100; exec \"$0\" {} --capture {file} --capture-episodes 20",
-            SIL.join(" ")
-        );
-        let mut shell = std::process::Command::new("sh");
+        let script =
+            format!("trap '' XFSZ; ulimit -f 600; exec \"$0\" {} {option} {file} --capture-episodes 20", SIL.join(" "));
+        let mut shell = Command::new("sh");
         let output = shell.arg("-c").arg(script).arg(program).current_dir(folder.path()).output().unwrap();
         let complaint = String::from_utf8(output.stderr).unwrap();
         assert!(!output.status.success() && complaint.lines().count() == 1, "{complaint}");
-        assert!(complaint.contains("the capture cannot be written: "), "{complaint}");
+        assert!(complaint.contains("what is to be written down cannot be written: "), "{complaint}");
         let length = std::fs::metadata(folder.path().join(file)).unwrap().len();
-        assert!((least..=51_200).contains(&length), "{length}");
+        assert!((least..=307_200).contains(&length), "{length}");
     }
     let text = std::fs::read_to_string(folder.path().join("bus.log")).unwrap();
     let log = composer_sim_bridge::candump::Log::parse(&text).unwrap();
-    assert!(log.entries.len() > 300, "{}", log.entries.len());
+    assert!(log.entries.len() > 2000, "{}", log.entries.len());
+    // A recording is whole all the same: its end takes the place of what did not fit.
+    let recording = std::fs::read(folder.path().join("run.mcap")).unwrap();
+    assert!(recording.ends_with(b"\x89MCAP0\r\n"));
+    let counts = python(folder.path(), "recording.py", &["run.mcap"]);
+    assert!(counts["/tf"].as_u64().unwrap() > 10 && counts["/bus"].as_u64().unwrap() > 100, "{counts}");
 }

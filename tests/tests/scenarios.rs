@@ -91,3 +91,20 @@ fn a_campaign_goes_on_where_it_was_and_shards_make_the_same_file() {
     );
     refuse(folder.path(), &["campaign", "--number", "1", "--schedule", "explode:1"], &["unknown fault `explode`"]);
 }
+
+#[test]
+fn what_broke_a_rule_once_breaks_none_any_more() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
+    let corpus = std::fs::read_to_string(root.join("tests/campaign/corpus.txt")).unwrap();
+    let mut count = 0;
+    for line in corpus.lines().filter(|line| !line.starts_with('#')) {
+        let [policy, seed, modules, number, schedule] = line.split_whitespace().collect::<Vec<_>>()[..] else {
+            panic!("policy, seed, modules, number and schedule: {line}")
+        };
+        let run =
+            ["campaign", policy, "--seed", seed, "--modules", modules, "--number", number, "--schedule", schedule];
+        assert_eq!(succeed(root, &run).trim(), "no rule is broken", "{line}");
+        count += 1;
+    }
+    assert!(count >= 6, "{count}");
+}

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
 use composer_shared::policy::Task;
+use composer_sim_bridge::plant::Bench;
 use composer_sim_bridge::sil::{self, SilConfig};
 
 use super::PolicySource;
@@ -45,6 +46,12 @@ pub struct Arguments {
 enum What {
     /// Count the instructions of the controller on an emulated Cortex-M4F instead (needs qemu-system-arm).
     Firmware(firmware::Arguments),
+    /// Measure the controllers on the bus alone, with physics and without.
+    Bus {
+        /// Seconds for each figure
+        #[arg(long, default_value_t = 5.0)]
+        seconds: f64,
+    },
 }
 
 /// Control steps per second over all threads.
@@ -127,19 +134,49 @@ fn learning(modules: usize, cores: usize, seconds: f64) -> Result<Vec<Learning>>
     Ok(ways)
 }
 
-/// Virtual time by wall time of one thread, whole episodes on the bus.
-fn bus(image: &[u8], robot: &Robot, seconds: f64) -> Result<(f64, f64)> {
+/// How fast complete controllers run on the bus.
+#[derive(Clone, Copy, Debug)]
+struct BusSpeed {
+    /// Virtual time by wall time of one thread, whole episodes with physics.
+    with_physics: f64,
+    /// The same on a bench, where nothing moves.
+    alone: f64,
+    /// Share of the time in which the bus was busy.
+    load: f64,
+}
+
+fn bus(image: &[u8], robot: &Robot, seconds: f64) -> Result<BusSpeed> {
     let config = Arc::new(EnvConfig::new(Task::GoalReaching, robot.clone()));
+    let sil = SilConfig::new(composer_firmware::controller::BusKind::Fd);
     let (start, mut virtual_ns, mut load, mut episodes) = (Instant::now(), 0u64, 0.0, 0u64);
     while start.elapsed().as_secs_f64() < seconds {
         let mut plant = SnakePlant::new(config.clone(), episode_seed(DEFAULT_SEED, episodes));
-        let sil = SilConfig::new(composer_firmware::controller::BusKind::Fd);
         let report = sil::run(&mut plant, image, &sil, None, &mut |_, _| {})?;
         virtual_ns += report.duration_ns;
         load += report.bus_load;
         episodes += 1;
     }
-    Ok((virtual_ns as f64 * 1e-9 / start.elapsed().as_secs_f64(), load / episodes.max(1) as f64))
+    let with_physics = virtual_ns as f64 * 1e-9 / start.elapsed().as_secs_f64();
+    let (start, mut virtual_ns) = (Instant::now(), 0u64);
+    while start.elapsed().as_secs_f64() < seconds {
+        let mut bench = Bench { modules: robot.modules, steps: 2000 };
+        virtual_ns += sil::run(&mut bench, image, &sil, None, &mut |_, _| {})?.duration_ns;
+    }
+    let alone = virtual_ns as f64 * 1e-9 / start.elapsed().as_secs_f64();
+    Ok(BusSpeed { with_physics, alone, load: load / episodes.max(1) as f64 })
+}
+
+/// The table of the bus.
+fn buses(robot: &Robot, seconds: f64) -> Result<()> {
+    let source = PolicySource::load("goal-reaching")?;
+    let Some(image) = source.image() else { return Ok(()) };
+    println!("\ncontrollers on the CAN-FD bus (1M/5M), times real time, one thread");
+    println!("{:>8} {:>13} {:>16} {:>10}", "modules", "with physics", "without physics", "bus load");
+    for modules in LENGTHS {
+        let speed = bus(image, &robot.with_modules(modules)?, seconds)?;
+        println!("{modules:>8} {:>13.1} {:>16.1} {:>8.1} %", speed.with_physics, speed.alone, 100.0 * speed.load);
+    }
+    Ok(())
 }
 
 /// Sweeps of the direct solver in a step, and wall time of one with its share of the rest of the step, us; random torques.
@@ -199,8 +236,10 @@ fn gaits(robot: &Robot, mujoco: Option<&Path>) -> Result<()> {
 
 /// Runs the verb.
 pub fn run(arguments: &Arguments) -> Result<()> {
-    if let Some(What::Firmware(arguments)) = &arguments.what {
-        return firmware::run(arguments);
+    match &arguments.what {
+        Some(What::Firmware(arguments)) => return firmware::run(arguments),
+        Some(What::Bus { seconds }) => return buses(&Robot::default(), *seconds),
+        None => {}
     }
     let seconds = arguments.seconds;
     let cores = super::cores();
@@ -250,13 +289,5 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             way.threads
         );
     }
-    if let Some(image) = PolicySource::load("goal-reaching")?.image() {
-        println!("\ncontrollers on the CAN-FD bus (1M/5M) with physics, one thread");
-        println!("{:>8} {:>16} {:>10}", "modules", "times real time", "bus load");
-        for modules in LENGTHS {
-            let (factor, load) = bus(image, &robot.with_modules(modules)?, seconds)?;
-            println!("{modules:>8} {factor:>16.1} {:>8.1} %", 100.0 * load);
-        }
-    }
-    Ok(())
+    buses(&robot, seconds)
 }

@@ -253,6 +253,11 @@ fn report(lines: &[Line], arguments: &Arguments, out: &Path) -> Result<()> {
                 "    snakectl campaign {} --seed {}{modules} --number {number} --schedule '{}'",
                 arguments.policy, arguments.seed, found.schedule
             );
+            let modules = arguments.modules.unwrap_or(Robot::default().modules);
+            println!(
+                "    to keep it, for tests/campaign/corpus.txt: {} {} {modules} {number} {}",
+                arguments.policy, arguments.seed, found.schedule
+            );
         }
     }
     println!("{} schedules, {} break a rule: {}", lines.len(), broken.len(), out.display());

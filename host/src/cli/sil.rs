@@ -1,5 +1,6 @@
 //! `snakectl sil`: complete controllers, each with the frozen policy, on a simulated CAN bus.
 
+use std::cell::RefCell;
 use std::fs::File;
 use std::io::BufWriter;
 use std::net::SocketAddr;
@@ -19,6 +20,7 @@ use super::PolicySource;
 use super::common::{Common, REPLAYED, table, write_replay};
 use crate::bus_trial::{BusReport, BusSettings, BusTrial, Written};
 use crate::external::Elsewhere;
+use crate::mcap::Recording;
 
 /// Kind of bus, on the command line.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
@@ -167,8 +169,11 @@ pub struct Files {
     /// Write the frames of the first episode as a candump log, or, if its name ends in .pcap, for Wireshark
     #[arg(long, value_name = "FILE")]
     capture: Option<PathBuf>,
-    /// So many of the first episodes
-    #[arg(long, value_name = "N", requires = "capture", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    /// Record the first episode for Foxglove, Rerun and other programs that read MCAP files: poses, bus, joints, torques, attention, faults
+    #[arg(long, value_name = "FILE.mcap")]
+    record: Option<PathBuf>,
+    /// Write so many of the first episodes into these files
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     capture_episodes: u32,
     /// Write beside it, as FILE.modules, what every module was told and answered, so that `snakectl replay` can run one of them again
     #[arg(long, requires = "capture")]
@@ -179,6 +184,7 @@ pub struct Files {
 struct Opened {
     log: Option<(PathBuf, BufWriter<File>)>,
     transcript: Option<(PathBuf, BufWriter<File>)>,
+    record: Option<(PathBuf, File)>,
 }
 
 impl Files {
@@ -188,12 +194,14 @@ impl Files {
             bail!("--replayable goes with a candump log: `snakectl replay` does not read pcap files");
         }
         let create = |path: PathBuf| match File::create(&path) {
-            Ok(file) => Ok((path, BufWriter::new(file))),
+            Ok(file) => Ok((path, file)),
             Err(error) => Err(error).with_context(|| format!("cannot write {}", path.display())),
         };
-        let log = self.capture.clone().map(create).transpose()?;
+        let buffered = |path| create(path).map(|(path, file)| (path, BufWriter::new(file)));
+        let log = self.capture.clone().map(buffered).transpose()?;
         let transcript = self.capture.as_deref().filter(|_| self.replayable).map(transcript_of);
-        Ok(Opened { log, transcript: transcript.map(create).transpose()? })
+        let record = self.record.clone().map(create).transpose()?;
+        Ok(Opened { log, transcript: transcript.map(buffered).transpose()?, record })
     }
 }
 
@@ -207,25 +215,37 @@ pub fn transcript_of(log: &Path) -> PathBuf {
 impl Opened {
     /// What is to be written down in these files, of runs with this policy.
     fn written(&mut self, policy: &str, trial: &BusTrial<'_>, episodes: usize) -> Result<Written<'_>> {
-        let Some((path, log)) = &mut self.log else { return Ok(Written::default()) };
-        let pcap = path.extension().is_some_and(|extension| extension == "pcap");
-        let mut capture = Capture::new(log, if pcap { Format::Pcap } else { Format::Candump })?;
-        if let Some((_, transcript)) = &mut self.transcript {
-            let image = Policy::parse(trial.image).map_err(|e| anyhow::anyhow!("{e}"))?;
-            let heading = Heading::new(policy, &image, trial.config.robot.modules);
-            capture = capture.with_transcript(transcript, &heading);
+        let mut written = Written::default();
+        if let Some((path, log)) = &mut self.log {
+            let pcap = path.extension().is_some_and(|extension| extension == "pcap");
+            let mut capture = Capture::new(log, if pcap { Format::Pcap } else { Format::Candump })?;
+            if let Some((_, transcript)) = &mut self.transcript {
+                let image = Policy::parse(trial.image).map_err(|e| anyhow::anyhow!("{e}"))?;
+                let heading = Heading::new(policy, &image, trial.config.robot.modules);
+                capture = capture.with_transcript(transcript, &heading);
+            }
+            written.capture = Some(capture);
         }
-        Ok(Written { episodes, capture: Some(capture) })
+        if let Some((path, file)) = &self.record {
+            let recording =
+                Recording::new(file.try_clone()?).with_context(|| format!("cannot write {}", path.display()))?;
+            written.recording = Some(RefCell::new(recording));
+        }
+        let any = written.capture.is_some() || written.recording.is_some();
+        Ok(Written { episodes: if any { episodes } else { 0 }, ..written })
     }
 
     fn paths(&self) -> impl Iterator<Item = &PathBuf> {
-        self.log.iter().chain(&self.transcript).map(|(path, _)| path)
+        let record = self.record.iter().map(|(path, _)| path);
+        self.log.iter().chain(&self.transcript).map(|(path, _)| path).chain(record)
     }
 }
 
 /// What has been written is whole.
 fn finish(written: Written<'_>) -> Result<()> {
-    Ok(written.capture.map_or(Ok(()), Capture::finish).map_err(SilError::Capture)?)
+    let recorded = written.recording.map_or(Ok(()), |recording| recording.into_inner().finish());
+    let captured = written.capture.map_or(Ok(()), Capture::finish);
+    Ok(recorded.and(captured).map_err(SilError::Capture)?)
 }
 
 /// Arguments of `sil`.

@@ -208,7 +208,7 @@ pub enum SilError {
         /// Why.
         error: Trouble,
     },
-    /// The capture cannot be written.
-    #[error("the capture cannot be written: {0}")]
+    /// What is to be written down of the run cannot be.
+    #[error("what is to be written down cannot be written: {0}")]
     Capture(#[from] io::Error),
 }
