@@ -187,7 +187,7 @@ pub struct Batch {
     pub heard: Vec<u64>,
     /// What each module remembered before, `[rows, memory]`, as it was in the rollout; empty for a policy that does not.
     pub memory: Vec<f32>,
-    /// Whether the sample follows the one before it in the same episode, so that what it remembers comes from there.
+    /// Whether the sample follows the one before it in the same episode, so that what it remembers comes from there; empty if none does.
     pub follows: Vec<bool>,
     /// Weight of each row in the actor's loss: 0 for dead modules.
     pub weights: Vec<f32>,
@@ -232,7 +232,7 @@ impl Batch {
             heard: self.heard[rows.clone()].to_vec(),
             memory: of(&self.memory),
             own: of(&self.own),
-            follows: self.follows[samples.clone()].to_vec(),
+            follows: self.follows.get(samples.clone()).unwrap_or_default().to_vec(),
             weights: of(&self.weights),
             actions: of(&self.actions),
             log_probabilities: of(&self.log_probabilities),
