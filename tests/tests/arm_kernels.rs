@@ -66,12 +66,12 @@ fn check(file: &[u8]) -> (bool, String) {
 
 #[test]
 fn the_processor_gives_the_hosts_bits() {
-    for seed in 1..=4 {
+    for seed in 1..=6 {
         let (file, results) = file(seed);
         let (good, said) = check(&file);
         assert!(good, "{said}");
         assert!(said.starts_with(&format!("{results} results of ")), "{said}");
-        assert!(results > 2_000, "{results}");
+        assert!(results > 1_500, "{results}");
         println!("seed {seed}: {said}");
     }
 }
