@@ -113,7 +113,7 @@ fn what_broke_a_rule_once_breaks_none_any_more() {
 #[test]
 fn a_scenario_runs_on_emulated_modules_too() {
     let folder = tempfile::tempdir().unwrap();
-    let scenario = "about = \"x\"\ntask = \"goal-reaching\"\nepisodes = 2\nfaults = \"unplug:#3@0.2s..0.4s\"\n\
+    let scenario = "about = \"x\"\ntask = \"goal-reaching\"\nepisodes = 2\nfaults = \"unplug:#3@0.2s..0.6s\"\n\
                     [expect]\ndead_seen_within = 4\none_time_keeper_within = 12\nlatent_age = \"20ms\"\n";
     std::fs::write(folder.path().join("emulated.toml"), scenario).unwrap();
     let row = |more: &[&str]| {
