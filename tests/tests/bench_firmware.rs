@@ -27,6 +27,15 @@ fn the_kernels_are_as_fast_as_promised() {
         assert!((0.8 * budget..=budget).contains(&longest), "{modules} modules: {longest} of {budget} instructions");
         assert!(modules > 8 || longest <= 90_000.0, "{longest}");
     }
+    // A new policy is checked in steps that the watchdog allows.
+    let budgets: toml::Table = toml::from_str(include_str!("../../firmware/budgets.toml")).unwrap();
+    let images = budgets["image"].as_array().unwrap();
+    let bench = images.iter().find(|image| image["program"].as_str() == Some("composer-qemu-bench")).unwrap();
+    for (name, budget) in [("update/signature", "signature_instructions"), ("update/kilobyte", "kilobyte_instructions")]
+    {
+        let limit = bench[budget].as_integer().unwrap() as f64;
+        assert!((0.5 * limit..=limit).contains(&count(name)), "{name}: {} of {limit}", count(name));
+    }
     let table = succeed(folder.path(), &["bench", "firmware", "--image", image]);
     for line in ["attention over 64 modules", "with the DSP extension", "framing, LATENT parsed", "1.5 cycles/insn"] {
         assert!(table.contains(line), "{table}");

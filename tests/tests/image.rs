@@ -24,6 +24,8 @@ const CONTROL_STEP: [&str; 2] =
 /// What runs after it, in images that have a service.
 const SERVICE: [&str; 2] =
     ["composer_firmware::service::Service::poll", "composer_firmware::service::Service::next_frame"];
+/// What checks the signature of a new policy, as a part of the service.
+const SIGNATURE: [&str; 1] = ["composer_firmware::update::verify::verify"];
 /// What decides about the transmit slots, and what takes a stop to the motors, in the interrupts of the board.
 const INTERRUPTS: [&str; 4] = [
     "composer_firmware::port::Sender::push",
@@ -59,6 +61,12 @@ struct Budget {
     step_stack: u32,
     /// None: the image has no service.
     service_stack: Option<u32>,
+    signature_stack: Option<u32>,
+    /// Counted in `bench_firmware.rs`.
+    #[serde(rename = "signature_instructions")]
+    _signature_instructions: Option<u64>,
+    #[serde(rename = "kilobyte_instructions")]
+    _kilobyte_instructions: Option<u64>,
     ram: Option<u64>,
     #[serde(default)]
     interrupts: Vec<String>,
@@ -119,6 +127,10 @@ fn images_stay_within_their_budgets() {
         if let Some(limit) = budget.service_stack {
             let (service, chain) = budget.deepest(&image, &SERVICE);
             complaints.extend(check(program, "the stack of the service", service.into(), limit.into(), &chain));
+        }
+        if let Some(limit) = budget.signature_stack {
+            let (signature, chain) = budget.deepest(&image, &SIGNATURE);
+            complaints.extend(check(program, "the stack of a signature", signature.into(), limit.into(), &chain));
         }
         if let Some(limit) = budget.ram {
             let (stack, chain) = budget.deepest(&image, &["Reset"]);

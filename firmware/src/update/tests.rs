@@ -3,7 +3,7 @@
 use std::vec::Vec;
 
 use composer_shared::policy::random_image;
-use composer_shared::update::{HEADER_SIZE, KEY_ID_SIZE, session};
+use composer_shared::update::{CHUNK_FRAME, Chunk, HEADER_SIZE, KEY_ID_SIZE, session};
 use composer_shared::wire::Operation;
 use ed25519_dalek::{Signer, SigningKey};
 
@@ -515,4 +515,88 @@ fn signatures_are_judged_as_dalek_judges_them() {
     }
     std::println!("{good} good, {bad} bad");
     assert!(good >= messages / 4 && bad >= messages / 4, "{good} {bad}");
+}
+
+/// Anything at all as header, chunk, piece, record and page of records: nothing panics, what is understood is written back as the same bytes, a module starts with
+/// one of its slots, and no header is authentic that dalek refuses. COMPOSER_FUZZ says how many inputs.
+#[test]
+fn any_bytes_are_survived_and_nothing_is_authentic_that_dalek_refuses() {
+    use ed25519_dalek::Verifier;
+    let inputs: u64 = std::env::var("COMPOSER_FUZZ").map_or(200_000, |text| text.parse().expect("a number"));
+    let mut random = Random(2);
+    let key = test_key(5);
+    let keys = [*key.verifying_key().as_bytes(), *test_key(6).verifying_key().as_bytes()];
+    let good = package(&image(1), 5, Some(&key));
+    let mut flash = G4::new();
+    let mut updater = boot(&mut flash, keys);
+    let (mut headers, mut chunked, mut recorded, mut judged, mut authentic) = (0u64, 0u64, 0u64, 0u64, 0u64);
+    let mut assembly = Assembly::EMPTY;
+    for input in 0..inputs {
+        let mut bytes: [u8; HEADER_SIZE] = *good.first_chunk().unwrap();
+        match random.next() % 8 {
+            0 => bytes = random.bytes(),
+            1 => {}
+            kind => {
+                for _ in 0..kind {
+                    // Mostly bytes that have few values, so that the rest is looked at, too.
+                    bytes[(random.next() % HEADER_SIZE as u64) as usize] =
+                        (random.next() >> (random.next() % 60)) as u8;
+                }
+            }
+        }
+        let length = if random.next() % 16 == 0 { (random.next() % HEADER_SIZE as u64) as usize } else { HEADER_SIZE };
+        if let Ok(header) = Header::new_checked(&bytes[..length]) {
+            headers += 1;
+            assert_eq!(header.repr().emit(header.signature()), bytes);
+            // The signature takes longer than all the rest.
+            if input % 64 == 0 {
+                judged += 1;
+                if updater.is_authentic(&header, header.repr()) {
+                    authentic += 1;
+                    let signature = ed25519_dalek::Signature::from_bytes(header.signature().unwrap());
+                    assert!(key.verifying_key().verify(header.signed_part(), &signature).is_ok());
+                    assert_eq!(bytes[..], good[..HEADER_SIZE]);
+                }
+            }
+        }
+        if let Some(chunk) = bytes.get(..CHUNK_FRAME).and_then(Chunk::new_checked) {
+            chunked += 1;
+            assert_eq!(chunk.repr().emit()[..], bytes[..CHUNK_FRAME]);
+            updater.hear_chunk(&chunk.repr());
+        }
+        if let Some(chunk) = assembly.push(bytes.last_chunk().unwrap()) {
+            assert!(usize::from(chunk.number) < CHUNKS_MAX);
+        }
+        updater.hear_piece(&Piece(*bytes.first_chunk().unwrap()));
+        let mut record: [u8; 8] = *bytes[40..].first_chunk().unwrap();
+        if random.next() % 2 == 0 {
+            record = Record {
+                kind: RecordKind::ALL[(random.next() % 5) as usize],
+                slot: if random.next() % 2 == 0 { Slot::A } else { Slot::B },
+                value: random.next() as u32 & 0x00ff_ffff,
+            }
+            .emit();
+        }
+        if let Some(read) = Record::parse(&record) {
+            recorded += 1;
+            assert_eq!(read.emit(), record);
+        }
+        // A place among the records, wherever; now and then the module starts with what has become of them.
+        let word = 2 * SLOT_SIZE / 8 + (random.next() % u64::from(2 * PLACES)) as usize;
+        flash.apply(&Op::Write { word: if random.next() % 8 == 0 { 2 * SLOT_SIZE / 8 } else { word }, value: record });
+        if input % 4096 == 0 {
+            let records = Records::open(&mut flash);
+            assert!(records.state().counter <= composer_shared::update::COUNTER_MAX);
+            let mut copy = flash.clone();
+            let started = Updater::start(&mut copy, keys, |_, _| input % 8192 == 0).started();
+            assert!(started.slot == Slot::A || started.slot == Slot::B);
+            if input % 65_536 == 0 {
+                flash = G4::new();
+            }
+        }
+    }
+    std::println!(
+        "{inputs} inputs: {headers} headers, {chunked} chunks, {recorded} records, {judged} judged, {authentic} authentic"
+    );
+    assert!(headers > inputs / 20 && chunked > inputs / 20 && recorded > inputs / 4 && authentic > 0);
 }

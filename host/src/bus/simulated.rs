@@ -91,7 +91,8 @@ impl Outside for Meeting {
                         Err(_) => Turn::End,
                     };
                 }
-                Ok(Wish::Receive(patience)) => self.until = Some(now + patience.as_nanos() as u64),
+                // Whoever has no patience left must not stop the time.
+                Ok(Wish::Receive(patience)) => self.until = Some(now + (patience.as_nanos() as u64).max(1_000)),
                 // The station has done what it wanted.
                 Err(_) => return Turn::End,
             }

@@ -100,10 +100,24 @@ impl std::fmt::Display for Progress {
 /// A row of the table at the end, read back from the module; none if it is silent.
 pub type Row = (u8, Option<Policies>);
 
+/// How often a module that is heard is asked in vain, each time several times: of many questions on a bad bus one may be lost that often.
+const PERSISTENCE: usize = 4;
+
+/// A value that a module that is on the bus will say sooner or later.
+fn value(station: &mut Station, node: u8, operation: Operation, index: u8) -> Result<u32, BusError> {
+    for _ in 1..PERSISTENCE {
+        match station.request(node, operation, index, 0) {
+            Err(BusError::Silent { heard: true, .. }) => {}
+            result => return result,
+        }
+    }
+    station.request(node, operation, index, 0)
+}
+
 /// What a module says of its policies.
 pub fn policies(station: &mut Station, node: u8) -> Result<Policies, BusError> {
-    let policy = station.request(node, Operation::Hello, 4, 0)?;
-    let mut item = |item| station.request(node, Operation::UpdateStatus, item, 0);
+    let policy = value(station, node, Operation::Hello, 4)?;
+    let mut item = |item| value(station, node, Operation::UpdateStatus, item);
     let (state, counter, task) = (item(16)?, item(17)?, item(23)?);
     Ok(Policies {
         policy,
@@ -278,13 +292,13 @@ impl Update<'_> {
     /// Chunks that a module lacks.
     fn lacks(&mut self, node: u8) -> Result<Vec<u16>, BusError> {
         let count = chunks(self.package.bytes().len());
-        let there = self.station.request(node, Operation::UpdateStatus, 19, 0)?;
+        let there = value(self.station, node, Operation::UpdateStatus, 19)?;
         if there as usize == count {
             return Ok(Vec::new());
         }
         let mut lacks = Vec::new();
         for word in 0..count.div_ceil(32) {
-            let bits = self.station.request(node, Operation::UpdateStatus, word as u8, 0)?;
+            let bits = value(self.station, node, Operation::UpdateStatus, word as u8)?;
             let numbers = (0..32).map(|bit| (32 * word + bit, bits >> bit & 1));
             lacks.extend(
                 numbers.filter(|(number, there)| *there == 0 && *number < count).map(|(number, _)| number as u16),

@@ -119,6 +119,8 @@ pub fn run(arguments: &Arguments) -> Result<()> {
 
     part("service, a frame when nothing is asked", "service/idle")?;
     part("service, a register read and answered", "service/read")?;
+    part("update, the signature of a policy", "update/signature")?;
+    part("update, a kilobyte of its digest", "update/kilobyte")?;
 
     println!("\n{:<44} {:>8} {:>10}", "fully connected int8, 64 x 64, requantised", "", "MAC/insn");
     let (dsp, portable) = (count("dense64/dsp")?, count("dense64/portable")?);
