@@ -544,12 +544,13 @@ fn any_bytes_are_survived_and_nothing_is_authentic_that_dalek_refuses() {
                 }
             }
         }
-        let length = if random.next() % 16 == 0 { (random.next() % HEADER_SIZE as u64) as usize } else { HEADER_SIZE };
+        let length =
+            if random.next().is_multiple_of(16) { (random.next() % HEADER_SIZE as u64) as usize } else { HEADER_SIZE };
         if let Ok(header) = Header::new_checked(&bytes[..length]) {
             headers += 1;
             assert_eq!(header.repr().emit(header.signature()), bytes);
             // The signature takes longer than all the rest.
-            if input % 64 == 0 {
+            if input.is_multiple_of(64) {
                 judged += 1;
                 if updater.is_authentic(&header, header.repr()) {
                     authentic += 1;
@@ -560,7 +561,7 @@ fn any_bytes_are_survived_and_nothing_is_authentic_that_dalek_refuses() {
             }
         }
         let mut frame: [u8; CHUNK_FRAME] = *bytes.first_chunk().unwrap();
-        if random.next() % 2 == 0 {
+        if random.next().is_multiple_of(2) {
             // A header's bytes at this place are no chunk's number: one about as large as there are.
             frame[2..4].copy_from_slice(&((random.next() % (2 * CHUNKS_MAX as u64)) as u16).to_le_bytes());
         }
@@ -574,10 +575,10 @@ fn any_bytes_are_survived_and_nothing_is_authentic_that_dalek_refuses() {
         }
         updater.hear_piece(&Piece(*bytes.first_chunk().unwrap()));
         let mut record: [u8; 8] = *bytes[40..].first_chunk().unwrap();
-        if random.next() % 2 == 0 {
+        if random.next().is_multiple_of(2) {
             record = Record {
                 kind: RecordKind::ALL[(random.next() % 5) as usize],
-                slot: if random.next() % 2 == 0 { Slot::A } else { Slot::B },
+                slot: if random.next().is_multiple_of(2) { Slot::A } else { Slot::B },
                 value: random.next() as u32 & 0x00ff_ffff,
             }
             .emit();
@@ -588,14 +589,17 @@ fn any_bytes_are_survived_and_nothing_is_authentic_that_dalek_refuses() {
         }
         // A place among the records, wherever; now and then the module starts with what has become of them.
         let word = 2 * SLOT_SIZE / 8 + (random.next() % u64::from(2 * PLACES)) as usize;
-        flash.apply(&Op::Write { word: if random.next() % 8 == 0 { 2 * SLOT_SIZE / 8 } else { word }, value: record });
-        if input % 4096 == 0 {
+        flash.apply(&Op::Write {
+            word: if random.next().is_multiple_of(8) { 2 * SLOT_SIZE / 8 } else { word },
+            value: record,
+        });
+        if input.is_multiple_of(4096) {
             let records = Records::open(&mut flash);
             assert!(records.state().counter <= composer_shared::update::COUNTER_MAX);
             let mut copy = flash.clone();
-            let started = Updater::start(&mut copy, keys, |_, _| input % 8192 == 0).started();
+            let started = Updater::start(&mut copy, keys, |_, _| input.is_multiple_of(8192)).started();
             assert!(started.slot == Slot::A || started.slot == Slot::B);
-            if input % 65_536 == 0 {
+            if input.is_multiple_of(65_536) {
                 flash = G4::new();
             }
         }
