@@ -6,7 +6,7 @@
 //! # Loss of power
 //!
 //! A word that loses its power while it is written may read as erased and yet not be writable, as anything, as what was to be written, or now like this and now like
-//! that, or reading it may fail. So a place counts only if it reads the same [`LOOKS`] times and its checksum is right; a place that is not erased, and one that
+//! that, or reading it may fail. So a place counts only if it reads the same four times and its checksum is right; a place that is not erased, and one that
 //! cannot be written, are skipped; and what must not be lost again once it was seen, Begin and Confirm, is written twice, the second time at the next start if the power
 //! went in between.
 
