@@ -15,7 +15,7 @@
 //! |---|---|
 //! | `{"transcript":1,"policy":"goal-reaching","crc32":"89abcdef","modules":8}` | the first line: version of this format, the policy as it was asked for, the checksum in its image, the length of the robot |
 //! | `{"run":0,"from_us":0}` | a run begins; its times are so much later in the log |
-//! | `{"computer":3,"node":3,"start":"0001..."}` | the computer of a node is switched on: the [`Start`](composer_firmware::link::ToModule::Start) of the [link](composer_firmware::link), in hexadecimal. A node that is plugged in again gets another computer |
+//! | `{"computer":3,"node":3,"start":"0001..."}` | the computer of a node is switched on: the [`Start`](composer_firmware::link::ToModule::Start) of the [link], in hexadecimal. A node that is plugged in again gets another computer |
 //! | `{"computer":3,"now":150200,"bus":0,"room":3,"line":17,...}` | it is polled, and answers |
 //! | `{"computer":3,"interrupt":"000#...","off":true}` | something interrupts it between two polls: a frame, or, if that is null, its stop input; whether its motors coast from then on, and what it `tells` at once, if anything |
 //!

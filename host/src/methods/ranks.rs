@@ -1,7 +1,7 @@
 //! Several processes (ranks) that train one policy together, each a share of the environments and of the gradients.
 //!
 //! After a rollout every rank gets what the environments of the others went through, so that all have the same rollout buffer. The chunks of
-//! a minibatch ([`super::on_policy::update`]) are shared out; everybody gets the sums of all chunks and adds them in their order. All the rest, all ranks do
+//! a minibatch ([`super::on_policy::update()`]) are shared out; everybody gets the sums of all chunks and adds them in their order. All the rest, all ranks do
 //! alike. So any number of ranks comes to the parameters of one process, bit for bit, and a checkpoint of one goes on with another number.
 
 use std::io::{Read, Write};

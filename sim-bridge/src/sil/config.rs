@@ -87,7 +87,7 @@ pub struct SilConfig {
     pub clocks: Vec<Clock>,
     /// Configured numbers of the modules, head first; those not listed have the right one.
     pub numbers: Vec<u8>,
-    /// Whether there is a station. Without one nobody tells the robot anything, unless somebody [`Outside`] does.
+    /// Whether there is a station. Without one nobody tells the robot anything, unless somebody outside ([`super::Outside`]) does.
     pub station: bool,
     /// Number of modules between the head end of the cable and the station: 0 puts it at the head end.
     pub station_behind: usize,

@@ -117,7 +117,7 @@ pub struct SilReport {
     pub faults: Vec<ScheduledFault>,
     /// Modules that somebody else took away; never any in the own process.
     pub lost: Vec<Lost>,
-    /// Whether the run ended by [`SilConfig::limit_ns`] instead of the plant being done.
+    /// Whether the run ended by [`super::SilConfig::limit_ns`] instead of the plant being done.
     pub cut_short: bool,
     /// The modules, head first.
     pub modules: Vec<ModuleReport>,
