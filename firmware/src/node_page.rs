@@ -48,9 +48,9 @@
 
 use core::fmt;
 
+use composer_shared::CRC_32;
 use composer_shared::robot::{AXES, MAX_JOINTS, MAX_MODULES};
 use composer_shared::update::{KEY_SIZE, Key};
-use crc::{CRC_32_ISO_HDLC, Crc};
 
 use crate::drivers::encoder::{JointCalibration, STEPS};
 use crate::failsafe::BusOffPolicy;
@@ -82,8 +82,6 @@ const RESERVED_AT: usize = MOTORS_AT + MOTOR_SIZE * AXES;
 const KEYS_AT: usize = RESERVED_AT + 4;
 const CRC_AT: usize = KEYS_AT + 2 * KEY_SIZE;
 const _: () = assert!(CRC_AT + 4 == SIZE);
-
-pub(crate) const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
 
 /// How far the rows of a rotation may be from orthonormal.
 const ORTHONORMAL: f32 = 1e-3;
@@ -266,7 +264,7 @@ impl NodePage {
             return Err(NodePageError::Magic);
         }
         let stored = word(CRC_AT).ok_or(short)?;
-        let computed = CRC.checksum(bytes.get(..CRC_AT).ok_or(short)?);
+        let computed = CRC_32.checksum(bytes.get(..CRC_AT).ok_or(short)?);
         if stored != computed {
             return Err(NodePageError::Checksum { stored, computed });
         }
@@ -367,7 +365,7 @@ impl NodePage {
         }
         put(KEYS_AT, self.keys.as_flattened());
         if let Some((body, crc)) = bytes.split_last_chunk_mut::<4>() {
-            *crc = CRC.checksum(body).to_le_bytes();
+            *crc = CRC_32.checksum(body).to_le_bytes();
         }
         Ok(bytes)
     }
@@ -483,7 +481,7 @@ pub(crate) mod tests {
     }
 
     fn mended(mut bytes: [u8; SIZE]) -> [u8; SIZE] {
-        let crc = CRC.checksum(&bytes[..CRC_AT]);
+        let crc = CRC_32.checksum(&bytes[..CRC_AT]);
         bytes[CRC_AT..].copy_from_slice(&crc.to_le_bytes());
         bytes
     }
@@ -507,9 +505,9 @@ pub(crate) mod tests {
         assert_eq!(bytes[172..176], 0.5f32.to_le_bytes());
         assert_eq!(bytes[176..180], [0; 4]);
         // The same checksum as the policy image's: of "123456789" it is 0xcbf43926.
-        assert_eq!(CRC.checksum(b"123456789"), 0xcbf4_3926);
+        assert_eq!(CRC_32.checksum(b"123456789"), 0xcbf4_3926);
         assert_eq!((&bytes[180..212], &bytes[212..214], bytes[243]), (&[0xa5; 32][..], &[0, 1][..], 31));
-        assert_eq!(bytes[244..], CRC.checksum(&bytes[..244]).to_le_bytes());
+        assert_eq!(bytes[244..], CRC_32.checksum(&bytes[..244]).to_le_bytes());
     }
 
     #[test]

@@ -21,6 +21,7 @@
 //! a call, at most one erasure, and the log erases only when it may: while the module is disarmed. A log that is full while
 //! the module is armed waits in memory.
 
+use composer_shared::CRC_32;
 use embedded_storage::nor_flash::{ErrorType, NorFlash, NorFlashErrorKind, ReadNorFlash, check_erase, check_write};
 
 use crate::node_page::{self, NodePage, NodePageError};
@@ -155,7 +156,7 @@ impl Entry {
 
 /// The lower half of the checksum that node pages have.
 fn check(body: &[u8; 14]) -> [u8; 2] {
-    let [low, high, _, _] = node_page::CRC.checksum(body).to_le_bytes();
+    let [low, high, _, _] = CRC_32.checksum(body).to_le_bytes();
     [low, high]
 }
 

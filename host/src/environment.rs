@@ -37,6 +37,11 @@ impl View {
     }
 }
 
+/// Masks of who hears whom, one a module from the first on, with every module's own bit set.
+pub fn with_itself(heard: &[u64]) -> impl Iterator<Item = u64> + '_ {
+    heard.iter().enumerate().map(|(module, heard)| heard | 1 << module)
+}
+
 /// Kinds of faults that a [`Lesson`] tells apart: motors dead, sensors blind, unplugged.
 pub const KINDS: usize = 3;
 /// Places along the robot that it tells apart.

@@ -215,22 +215,20 @@ pub(crate) mod testing {
     //! Networks and observations that are random but of realistic size.
 
     use composer_shared::observation::Observation;
+    use composer_shared::random::SplitMix64;
 
     use super::*;
 
     /// Normally distributed numbers from a seed (SplitMix64, sum of twelve).
-    pub struct Normal(u64);
+    pub struct Normal(SplitMix64);
 
     impl Normal {
         pub fn new(seed: u64) -> Self {
-            Normal(seed)
+            Normal(SplitMix64(seed))
         }
 
         fn uniform(&mut self) -> f32 {
-            self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-            let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-            let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-            (z >> 40) as f32 / (1u32 << 24) as f32
+            (self.0.next_u64() >> 40) as f32 / (1u32 << 24) as f32
         }
 
         pub fn sample(&mut self) -> f32 {

@@ -56,7 +56,7 @@ impl<P: Policy + ?Sized> Policy for &P {
 }
 
 /// Room for the actions of all modules: zeros.
-fn still(view: &View, actions: &mut Vec<[f32; 2]>) {
+pub(crate) fn still(view: &View, actions: &mut Vec<[f32; 2]>) {
     actions.clear();
     actions.resize(view.observations.len(), [0.0; 2]);
 }

@@ -5,8 +5,8 @@ use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
+use composer_shared::CRC_32;
 use composer_shared::policy::Policy;
-use crc::{CRC_32_ISO_HDLC, Crc};
 use serde_json::Value;
 
 use crate::env::{FaultTraining, SnakeEnv};
@@ -126,7 +126,7 @@ fn fingerprint(config: &RunConfig) -> String {
             }
         }
     }
-    let digest = Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(toml::to_string(&world).unwrap_or_default().as_bytes());
+    let digest = CRC_32.checksum(toml::to_string(&world).unwrap_or_default().as_bytes());
     format!(
         "{} on {} with {} modules, settings {digest:08x}",
         config.task.name, config.robot.name, config.robot.modules

@@ -14,8 +14,12 @@ pub mod nn;
 pub mod observation;
 pub mod policies;
 pub mod policy;
+pub mod random;
 pub mod registers;
 pub mod robot;
 pub mod sha512;
 pub mod update;
 pub mod wire;
+
+/// CRC-32 (ISO-HDLC), which policy images, updates, node pages, records and files are checked and told apart by.
+pub const CRC_32: crc::Crc<u32> = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC);

@@ -18,10 +18,10 @@
 
 use core::fmt;
 
-use crc::{CRC_32_ISO_HDLC, Crc};
-
+use crate::CRC_32;
 use crate::nn::{self, Dense};
 use crate::observation::{self, Observation, POINTS, Seeker};
+use crate::random::SplitMix64;
 use crate::robot::{AXES, Geometry, Limits, MAX_JOINTS, ROOM};
 
 /// Version of the layout that this code reads and writes.
@@ -527,8 +527,6 @@ const CRC_AT: usize = Layer::Output.offset() + Layer::Output.size();
 /// Bytes of an image.
 pub const IMAGE_SIZE: usize = CRC_AT + 4;
 
-const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
-
 /// The message a module sends to the others.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Latent {
@@ -623,7 +621,7 @@ impl<'a> Policy<'a> {
         let u32_at = |at: usize| bytes(image, at).map(|b| u32::from_le_bytes(*b));
         let f32_at = |at: usize| u32_at(at).map(f32::from_bits);
 
-        let computed = CRC.checksum(image.get(..CRC_AT)?);
+        let computed = CRC_32.checksum(image.get(..CRC_AT)?);
         let stored = u32_at(CRC_AT)?;
         if stored != computed {
             return Some(Err(PolicyError::Checksum { stored, computed }));
@@ -1066,9 +1064,9 @@ impl<'a> ImageWriter<'a> {
 }
 
 /// Writes the checksum over everything before it.
-fn seal(image: &mut [u8; IMAGE_SIZE]) {
+pub fn seal(image: &mut [u8; IMAGE_SIZE]) {
     if let Some((body, checksum)) = image.split_last_chunk_mut::<4>() {
-        *checksum = CRC.checksum(body).to_le_bytes();
+        *checksum = CRC_32.checksum(body).to_le_bytes();
     }
 }
 
@@ -1096,14 +1094,8 @@ pub fn random_image_of(shape: Shape, seed: u32, image: &mut [u8; IMAGE_SIZE]) {
         relax_seconds: 0.25,
         task_digest: 0,
     };
-    // SplitMix64.
-    let mut state = u64::from(seed);
-    let mut next = move || {
-        state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let z = (state ^ (state >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        (z >> 56) as i8
-    };
+    let mut random = SplitMix64(u64::from(seed));
+    let mut next = move || random.byte() as i8;
     let mut writer = ImageWriter::new(&meta, shape, image);
     let (inputs, features) = (usize::from(shape.inputs), EMBED + usize::from(shape.memory));
     for field in 0..inputs {
@@ -1227,7 +1219,7 @@ mod tests {
     fn the_layout_is_the_documented_one() {
         assert_eq!(Layer::ALL.map(Layer::offset), [516, 4104, 5452, 6800, 9492, 15128, 17436]);
         assert_eq!((IMAGE_SIZE, MEAN_AT, SOFTMAX_AT, CRC_AT), (17588, 72, 456, 17584));
-        assert_eq!(CRC.checksum(b"123456789"), 0xcbf4_3926);
+        assert_eq!(CRC_32.checksum(b"123456789"), 0xcbf4_3926);
         let document = include_str!("../policy-format.md");
         for layer in Layer::ALL {
             let (outputs, inputs, multipliers) = (layer.outputs(), layer.inputs(), layer.offset() + 4);
@@ -1410,7 +1402,7 @@ mod tests {
         let image = random(7);
         let policy = Policy::parse(&image[..]).unwrap();
         let (encoded, latents) = encode_all(&policy, &observations(7));
-        let mut digest = CRC.digest();
+        let mut digest = CRC_32.digest();
         for (i, own) in encoded.iter().enumerate() {
             own.latent.key.iter().chain(&own.latent.value).for_each(|x| digest.update(&x.to_le_bytes()));
             let mut attention = [0; MAX_MODULES];
@@ -1427,7 +1419,7 @@ mod tests {
         let mut image = Box::new([0; IMAGE_SIZE]);
         random_image_of(Shape::FULL, 7, &mut image);
         let policy = Policy::parse(&image[..]).unwrap();
-        let (mut memories, mut digest) = ([Memory::EMPTY; 8], CRC.digest());
+        let (mut memories, mut digest) = ([Memory::EMPTY; 8], CRC_32.digest());
         for step in 0..20 {
             let mut latents = [Latent::ZERO; MAX_MODULES];
             let observations = observations(7 + step);

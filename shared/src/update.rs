@@ -6,11 +6,8 @@
 
 use core::fmt;
 
-use crc::{CRC_32_ISO_HDLC, Crc};
-
+use crate::CRC_32;
 use crate::policy::Task;
-
-const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
 
 /// The first bytes of every header.
 pub const MAGIC: [u8; 8] = *b"COMPSIGN";
@@ -274,7 +271,7 @@ pub const fn chunks(total: usize) -> usize {
 
 /// The number by which chunks of one policy are told from those of another: from all its bytes, so that an update that was interrupted can go on.
 pub fn session(package: &[u8]) -> u16 {
-    CRC.checksum(package) as u16
+    CRC_32.checksum(package) as u16
 }
 
 /// A chunk in place.
@@ -482,7 +479,7 @@ impl Record {
     /// Reads a record; `None` if the checksum or a number is wrong, erased flash among them.
     pub fn parse(bytes: &[u8; RECORD_SIZE]) -> Option<Self> {
         let [head, a, b, c, check @ ..] = *bytes;
-        if CRC.checksum(&[head, a, b, c]).to_le_bytes() != check {
+        if CRC_32.checksum(&[head, a, b, c]).to_le_bytes() != check {
             return None;
         }
         let kind = RecordKind::ALL.into_iter().find(|kind| *kind as u8 == head & 15)?;
@@ -493,7 +490,7 @@ impl Record {
     pub fn emit(&self) -> [u8; RECORD_SIZE] {
         let [a, b, c, _] = self.value.to_le_bytes();
         let head = self.kind as u8 | (self.slot as u8) << 4;
-        let [w, x, y, z] = CRC.checksum(&[head, a, b, c]).to_le_bytes();
+        let [w, x, y, z] = CRC_32.checksum(&[head, a, b, c]).to_le_bytes();
         [head, a, b, c, w, x, y, z]
     }
 }

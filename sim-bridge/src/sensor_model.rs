@@ -18,6 +18,7 @@ use composer_firmware::drivers::encoder::STEPS;
 use composer_firmware::drivers::sensors::SPEED_BANDWIDTH;
 use composer_shared::math::sin_cos;
 use composer_shared::observation::Sensors;
+use composer_shared::random::SplitMix64;
 use composer_shared::robot::{AXES, MAX_JOINTS};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -225,15 +226,12 @@ fn quantise(value: f32, (step, per_unit): (f32, f32)) -> f32 {
 
 /// Noise, fast: splitmix64, and the sum of four even numbers for a normal one (right to the fourth moment within 10 %, none beyond 3.5).
 #[derive(Clone, Copy, Debug)]
-struct Random(u64);
+struct Random(SplitMix64);
 
 impl Random {
     #[inline]
     fn normal(&mut self) -> f32 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        let z = z ^ (z >> 31);
+        let z = self.0.next_u64();
         let sum = (z & 0xffff) + (z >> 16 & 0xffff) + (z >> 32 & 0xffff) + (z >> 48);
         // The mean of the sum, and one over its standard deviation: 65536 sqrt(4 / 12).
         (sum as i32 - 131_070) as f32 * (1.732_050_8 / 65536.0)
@@ -280,7 +278,7 @@ impl ModuleSensorState {
     pub fn new(model: &SensorModel, seed: u64) -> Self {
         let SensorModel { accelerometer, gyroscope, encoder } = model;
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let mut random = Random(rng.next_u64());
+        let mut random = Random(SplitMix64(rng.next_u64()));
         let bandwidth = (1.0 / (2.0 * PERIOD)).sqrt();
         let mg = 1e-3;
         let mdps = 1e-3 * PI / 180.0;
@@ -487,7 +485,7 @@ mod tests {
         {
             let mut here = ModuleSensorState::new(&SensorModel { encoder, ..SensorModel::none() }, 5);
             let mut board = SpeedEstimator::new(SPEED_BANDWIDTH);
-            let mut random = Random(9);
+            let mut random = Random(SplitMix64(9));
             let (mut apart, mut rough_here, mut rough_board) = (Vec::new(), Vec::new(), Vec::new());
             here.rest(&Truth { joint_angles: [angle(0.0); 4], ..LEVEL });
             board.update(angle(0.0), 1e-3);

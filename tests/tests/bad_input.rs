@@ -46,7 +46,7 @@ fn a_damaged_policy_image_is_refused() {
 
 #[test]
 fn a_policy_of_another_task_is_refused() {
-    use composer_shared::policy::{IMAGE_SIZE, Policy, Task, random_image};
+    use composer_shared::policy::{IMAGE_SIZE, Policy, Task, random_image, seal};
     let folder = tempfile::tempdir().unwrap();
     let mut image = [0; IMAGE_SIZE];
     random_image(3, &mut image);
@@ -55,30 +55,17 @@ fn a_policy_of_another_task_is_refused() {
     let at = image.iter().enumerate().position(|(i, _)| {
         let mut other = image;
         other[i] = Task::TubeCrossing as u8;
-        mend(&mut other);
+        seal(&mut other);
         Policy::parse(&other).is_ok_and(|p| p.task() == Task::TubeCrossing)
     });
     let at = at.expect("some byte says the task");
     image[at] = Task::TubeCrossing as u8;
-    mend(&mut image);
+    seal(&mut image);
     std::fs::write(folder.path().join("tube.policy"), image).unwrap();
     for verb in ["eval", "sil"] {
         let wanted = [verb, "tube.policy", "--task", "goal-reaching"];
         refuse(folder.path(), &wanted, &["trained for tube-crossing", "cannot do goal-reaching"]);
     }
-}
-
-/// Recomputes the CRC-32 (ISO-HDLC) at the end of an image.
-fn mend(image: &mut [u8]) {
-    let split = image.len() - 4;
-    let mut crc = u32::MAX;
-    for &byte in &image[..split] {
-        crc ^= u32::from(byte);
-        for _ in 0..8 {
-            crc = (crc >> 1) ^ (0xedb8_8320 & (crc & 1).wrapping_neg());
-        }
-    }
-    image[split..].copy_from_slice(&(!crc).to_le_bytes());
 }
 
 #[test]

@@ -26,6 +26,7 @@ use composer_shared::nn::Dense;
 use composer_shared::observation::{Motors, Seeker, Sensors, Told, observe};
 use composer_shared::policies;
 use composer_shared::policy::{IMAGE_SIZE, Latent, Memory, OBS, Policy, Shape, random_image_of};
+use composer_shared::random::SplitMix64;
 use composer_shared::registers::Register;
 use composer_shared::robot::{Geometry, MAX_MODULES};
 use composer_shared::sha512::Sha512;
@@ -52,15 +53,12 @@ const JOINING: u16 = 5;
 /// Frames that a module receives in one control cycle at most: SYNC, GOAL, and STATE and LATENT of each other module.
 const FRAMES: usize = 2 * MAX_MODULES;
 
-/// Numbers without a meaning, the same ones every time (splitmix64).
-struct Random(u64);
+/// Numbers without a meaning, the same ones every time.
+struct Random(SplitMix64);
 
 impl Random {
     fn byte(&mut self) -> u8 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        (z >> 56) as u8
+        self.0.byte()
     }
 
     fn angle(&mut self) -> f32 {
@@ -367,7 +365,7 @@ fn main() -> ! {
         core.SYST.enable_counter();
     }
     report(format_args!("controller_bytes"), size_of::<Controller>() as u32);
-    let mut random = Random(1);
+    let mut random = Random(SplitMix64(1));
     report(format_args!("calibration"), count(thousand_nops));
     dense(&mut random);
     match policies::shipped("goal-reaching").map(Policy::parse) {

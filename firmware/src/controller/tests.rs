@@ -6,7 +6,7 @@ use std::string::ToString;
 use std::vec;
 use std::vec::Vec;
 
-use composer_shared::policy::{IMAGE_SIZE, Shape, Task, random_image, random_image_of};
+use composer_shared::policy::{IMAGE_SIZE, Shape, Task, random_image, random_image_of, seal};
 use composer_shared::wire::{ALL_MODULES, Function};
 use proptest::prelude::*;
 
@@ -28,11 +28,7 @@ fn policy(seed: u32, patch: &[(usize, u8)]) -> Policy<'static> {
     for (at, value) in patch {
         image[*at] = *value;
     }
-    let (body, checksum) = image.split_at_mut(IMAGE_SIZE - 4);
-    let crc = body.iter().fold(u32::MAX, |crc, byte| {
-        (0..8).fold(crc ^ u32::from(*byte), |crc, _| crc >> 1 ^ if crc & 1 != 0 { 0xedb8_8320 } else { 0 })
-    });
-    checksum.copy_from_slice(&(!crc).to_le_bytes());
+    seal(image);
     Policy::parse(image).unwrap()
 }
 

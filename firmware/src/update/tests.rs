@@ -3,6 +3,7 @@
 use std::vec::Vec;
 
 use composer_shared::policy::random_image;
+use composer_shared::random::SplitMix64;
 use composer_shared::update::{CHUNK_FRAME, Chunk, HEADER_SIZE, KEY_ID_SIZE, session};
 use composer_shared::wire::Operation;
 use ed25519_dalek::{Signer, SigningKey};
@@ -458,15 +459,12 @@ fn zeros_are_no_records() {
     assert_eq!(runs(&flash.clone(), &boot(&mut flash, LAB)), crc_of(&new));
 }
 
-/// Numbers without a meaning, the same ones every time (splitmix64).
-struct Random(u64);
+/// Numbers without a meaning, the same ones every time.
+struct Random(SplitMix64);
 
 impl Random {
     fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
+        self.0.next_u64()
     }
 
     fn bytes<const N: usize>(&mut self) -> [u8; N] {
@@ -478,7 +476,7 @@ impl Random {
 #[test]
 fn signatures_are_judged_as_dalek_judges_them() {
     let messages = if std::env::var_os("COMPOSER_EXHAUSTIVE").is_some() { 100_000 } else { 1_000 };
-    let mut random = Random(1);
+    let mut random = Random(SplitMix64(1));
     let (mut good, mut bad) = (0, 0);
     // The order of the group, and points of small order.
     let order: [u8; 32] = [
@@ -523,7 +521,7 @@ fn signatures_are_judged_as_dalek_judges_them() {
 fn any_bytes_are_survived_and_nothing_is_authentic_that_dalek_refuses() {
     use ed25519_dalek::Verifier;
     let inputs: u64 = std::env::var("COMPOSER_FUZZ").map_or(200_000, |text| text.parse().expect("a number"));
-    let mut random = Random(2);
+    let mut random = Random(SplitMix64(2));
     let key = test_key(5);
     let keys = [*key.verifying_key().as_bytes(), *test_key(6).verifying_key().as_bytes()];
     let good = package(&image(1), 5, Some(&key));

@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, Seek, SeekFrom, Write};
 
-use crc::{CRC_32_ISO_HDLC, Crc};
+use composer_shared::CRC_32;
 
 const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
 const HEADER: u8 = 0x01;
@@ -64,10 +64,6 @@ fn record(out: &mut Vec<u8>, opcode: u8, content: &Bytes) {
     out.push(opcode);
     out.extend((content.0.len() as u64).to_le_bytes());
     out.extend(&content.0);
-}
-
-fn crc(bytes: &[u8]) -> u32 {
-    Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(bytes)
 }
 
 /// A chunk that has been written.
@@ -164,7 +160,7 @@ impl Writer {
         let times = places.values().flatten().map(|(time, _)| *time);
         let times = [times.clone().min().unwrap_or(0), times.max().unwrap_or(0)];
         let mut bytes = Vec::with_capacity(open.len() + 4096);
-        let content = Bytes::default().u64(times[0]).u64(times[1]).u64(open.len() as u64).u32(crc(&open));
+        let content = Bytes::default().u64(times[0]).u64(times[1]).u64(open.len() as u64).u32(CRC_32.checksum(&open));
         record(&mut bytes, CHUNK, &content.text("").u64(open.len() as u64).raw(&open));
         let (length, mut indexes) = (bytes.len() as u64, BTreeMap::new());
         for (channel, places) in &places {
@@ -251,7 +247,7 @@ impl Writer {
         checked.push(FOOTER);
         checked.extend(20u64.to_le_bytes());
         checked.extend(&footer.0);
-        record(&mut out, FOOTER, &footer.u32(crc(&checked)));
+        record(&mut out, FOOTER, &footer.u32(CRC_32.checksum(&checked)));
         out.extend(MAGIC);
         self.file.write_all(&out)?;
         self.file.flush()

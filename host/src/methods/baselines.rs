@@ -18,7 +18,7 @@ use super::random::{Stream, stream};
 use super::smp::SmpPolicy;
 use super::tensors::{Weights, floats};
 use super::{Algorithm, MakeEnvironment, Method, checked};
-use crate::environment::View;
+use crate::environment::{View, with_itself};
 use crate::policy::{Memories, Policy};
 
 /// Declares the settings of a baseline, with its authors' as defaults.
@@ -354,7 +354,7 @@ impl<N: TensorNetworks> Policy for TensorPolicy<'_, N> {
         let all = view.observations.len();
         // Modules beyond those that the networks are made for hang limp.
         let n = self.networks.most_modules().map_or(all, |most| all.min(most));
-        let heard: Vec<u64> = view.heard[..n].iter().enumerate().map(|(module, heard)| heard | 1 << module).collect();
+        let heard: Vec<u64> = with_itself(&view.heard[..n]).collect();
         let observations = self.saved.normalised(view);
         let seen = seen(&self.weights, &observations[..n * BASE], &heard, n);
         let noise = self.weights.tensor(&vec![0.0; n * ACTIONS], [n, ACTIONS]);

@@ -35,11 +35,11 @@ pub use self::baselines::SavedWeights;
 pub use self::composer::Differentiation;
 use self::composer::float::FloatPolicy;
 pub use self::config::TrainConfig;
-pub(crate) use self::random::mix;
 use self::ranks::Ranks;
 use crate::environment::{Environment, Outcome};
 use crate::network::Network;
 use crate::policy::Policy;
+pub(crate) use composer_shared::random::mix;
 
 /// How a policy is built and trained.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

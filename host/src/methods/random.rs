@@ -1,5 +1,6 @@
 //! Random numbers of a run: the rule by which every stream is derived from its seed.
 
+use composer_shared::random::mix;
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -23,14 +24,6 @@ pub enum Stream {
 pub fn derive_seed(run_seed: u64, stream: Stream, major: u64, minor: u64) -> u64 {
     // SplitMix64's finaliser over each part in turn: changing any bit of any part changes about half of the result's bits.
     [stream as u64, major, minor].into_iter().fold(mix(run_seed), |state, part| mix(state ^ mix(part)))
-}
-
-/// SplitMix64's finaliser.
-pub(crate) fn mix(x: u64) -> u64 {
-    let mut z = x.wrapping_add(0x9e37_79b9_7f4a_7c15);
-    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    z ^ (z >> 31)
 }
 
 /// The generator of a stream (see [`derive_seed`]).

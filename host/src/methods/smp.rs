@@ -30,7 +30,7 @@ use super::on_policy::collect::ACTIONS;
 use super::random::{Stream, stream};
 use super::tensors::{Activation, Layout, Scheme, Weights, floats};
 use super::{MakeEnvironment, Method, SavedWeights, TrainedPolicy};
-use crate::environment::View;
+use crate::environment::{View, with_itself};
 use crate::policy::{Memories, Policy};
 
 /// Numbers in a message.
@@ -296,7 +296,7 @@ impl Policy for SmpPolicy {
         _attention: Option<&mut Vec<f32>>,
     ) {
         let modules = view.observations.len();
-        let heard: Vec<u64> = view.heard.iter().enumerate().map(|(module, heard)| heard | 1 << module).collect();
+        let heard: Vec<u64> = with_itself(&view.heard).collect();
         let seen = seen(&self.actor, &raw(view), &heard, modules);
         let all = floats(self.networks.act(&self.actor, &seen));
         actions.clear();

@@ -3,9 +3,9 @@
 use std::path::Path;
 
 use anyhow::{Context, Result, bail};
+use composer_shared::CRC_32;
 use composer_shared::policies;
 use composer_shared::policy::{Policy as Image, Task};
-use crc::{CRC_32_ISO_HDLC, Crc};
 use serde::{Deserialize, Serialize};
 
 use super::measure::{ATTENDED, Measured, Point, kept, measure};
@@ -32,7 +32,7 @@ struct Trained {
 }
 
 fn digest(bytes: &[u8]) -> String {
-    format!("{:08x}", Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(bytes))
+    format!("{:08x}", CRC_32.checksum(bytes))
 }
 
 /// How far a run is.

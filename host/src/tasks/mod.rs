@@ -20,8 +20,8 @@ pub mod wall_climbing;
 #[cfg(test)]
 mod soundness;
 
+use composer_shared::CRC_32;
 use composer_shared::policy::Task;
-use crc::{CRC_32_ISO_HDLC, Crc};
 use pathfinding::kuhn_munkres::kuhn_munkres_min;
 use pathfinding::matrix::Matrix;
 use rand::{Rng, RngExt};
@@ -265,7 +265,7 @@ impl TaskConfig {
         let mut lines: Vec<String> = self.judged().iter().map(|(name, value)| format!("{name} {value}\n")).collect();
         lines.sort();
         let text = format!("{}\n{}", self.settings.name, lines.concat());
-        Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(text.as_bytes()).max(1)
+        CRC_32.checksum(text.as_bytes()).max(1)
     }
 
     /// How the settings that an episode depends on differ from those of `other`, such as `success_distance = 1 instead of 1.5`; empty if they do not.

@@ -8,6 +8,7 @@ use std::fs;
 use std::io;
 use std::path::Path;
 
+use composer_shared::CRC_32;
 use thiserror::Error;
 
 use crate::files;
@@ -20,7 +21,6 @@ pub const FILE: &str = "checkpoint.bin";
 const MAGIC: &[u8; 8] = b"CMPSRCK3";
 /// How the magic numbers of all versions begin.
 const FAMILY: &[u8] = b"CMPSRCK";
-const CRC: crc::Crc<u32> = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC);
 
 /// Why a checkpoint was not read or written.
 #[derive(Debug, Error)]
@@ -92,7 +92,7 @@ impl Checkpoint {
             number(&mut out, self.state.replay.len() as u64);
             self.state.replay.iter().for_each(|x| out.extend_from_slice(&x.to_le_bytes()));
         }
-        out.extend_from_slice(&CRC.checksum(&out).to_le_bytes());
+        out.extend_from_slice(&CRC_32.checksum(&out).to_le_bytes());
         out
     }
 
@@ -146,7 +146,7 @@ impl Checkpoint {
             });
         };
         let Some((body, checksum)) = body.split_last_chunk::<4>() else { return Err(CheckpointError::Damaged(name)) };
-        if CRC.checksum(&bytes[..bytes.len() - 4]) != u32::from_le_bytes(*checksum) {
+        if CRC_32.checksum(&bytes[..bytes.len() - 4]) != u32::from_le_bytes(*checksum) {
             return Err(CheckpointError::Damaged(name));
         }
         Self::decode(body).ok_or(CheckpointError::Damaged(name))

@@ -177,7 +177,7 @@ proptest! {
         }
         let mut whole = record;
         if from > 3 {
-            whole[4..].copy_from_slice(&CRC.checksum(&record[..4]).to_le_bytes());
+            whole[4..].copy_from_slice(&crate::CRC_32.checksum(&record[..4]).to_le_bytes());
         }
         if let Some(record) = Record::parse(&whole) {
             prop_assert_eq!(record.emit(), whole);

@@ -7,6 +7,8 @@
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 
+use composer_shared::random::SplitMix64;
+
 /// A reader under test.
 pub struct Target {
     /// Its name, and that of its folder.
@@ -32,14 +34,11 @@ pub fn corpus(folder: &Path) -> Vec<Vec<u8>> {
 }
 
 /// Random numbers by SplitMix64: a fuzzer spends its time elsewhere.
-struct Random(u64);
+struct Random(SplitMix64);
 
 impl Random {
     fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let z = (self.0 ^ self.0 >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        let z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ z >> 31
+        self.0.next_u64()
     }
 
     fn below(&mut self, end: usize) -> usize {
@@ -106,7 +105,8 @@ pub fn fuzz(targets: &[Target], inputs: u64) -> u64 {
                     let mut input = Vec::new();
                     for number in (thread..share).step_by(threads as usize) {
                         // Each input follows from its number alone.
-                        let mut random = Random(seed.wrapping_mul(0xd129_0c3d_3c4f_2d1b) ^ number.rotate_left(20));
+                        let mut random =
+                            Random(SplitMix64(seed.wrapping_mul(0xd129_0c3d_3c4f_2d1b) ^ number.rotate_left(20)));
                         change(target, &mut random, &mut input);
                         if catch_unwind(AssertUnwindSafe(|| (target.run)(&input))).is_err() {
                             panic!(

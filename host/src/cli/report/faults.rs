@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
+use composer_shared::CRC_32;
 use composer_shared::policies;
 use composer_shared::policy::Task;
 use composer_sim_bridge::faults::{FaultKind, FaultPlan, PlannedFault, Target};
@@ -203,7 +204,7 @@ fn specialists(
     }
     let folders: Vec<&Path> = runs.iter().map(|(folder, ..)| &**folder).collect();
     let key = |(_, config, plan): &(PathBuf, RunConfig, FaultPlan)| -> Result<String> {
-        let digest = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(toml::to_string(config)?.as_bytes());
+        let digest = CRC_32.checksum(toml::to_string(config)?.as_bytes());
         Ok(format!("{task} specialist {digest:08x} {plan} episodes={}", arguments.episodes))
     };
     let evaluated = |run: &(PathBuf, RunConfig, FaultPlan), threads: usize| -> Result<Measured> {

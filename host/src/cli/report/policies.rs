@@ -5,6 +5,7 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
+use composer_shared::CRC_32;
 use composer_shared::policy::{Policy, Task};
 use serde_json::{Value, json};
 
@@ -192,7 +193,7 @@ pub(super) fn world(env: &crate::env::EnvConfig) -> u32 {
         env.relax_seconds,
         env.sensors
     );
-    crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(text.as_bytes())
+    CRC_32.checksum(text.as_bytes())
 }
 
 /// The number of the median success; of an even number the lower one, of equals the earlier seed.

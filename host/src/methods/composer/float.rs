@@ -6,9 +6,9 @@ use composer_shared::policy::{CLIP, MEMORY, OUT};
 use composer_shared::robot::MAX_MODULES;
 
 use super::actor::{Actor, ActorLayout, ActorScratch, LATENT, Remembered, Shape};
-use crate::environment::View;
+use crate::environment::{View, with_itself};
 use crate::network::Network;
-use crate::policy::{Memories, Policy};
+use crate::policy::{Memories, Policy, still};
 
 /// A network, ready to run.
 #[derive(Clone, Debug)]
@@ -77,7 +77,7 @@ impl FloatPolicy {
         assert!(n <= MAX_MODULES, "{n} modules, at most {MAX_MODULES} are possible");
         assert!(heard.len() == n && actions.len() == n, "one mask and one action for each of {n} modules");
         assert_eq!(memories.len(), n, "one memory for each module");
-        let heard: Vec<u64> = heard.iter().enumerate().map(|(module, heard)| heard | 1 << module).collect();
+        let heard: Vec<u64> = with_itself(heard).collect();
         let mut scratch = ActorScratch::default();
         let scratch = self.pass(memories, observations, &heard, &[n], &mut scratch);
         for (action, mean) in actions.iter_mut().zip(scratch.means.as_chunks::<OUT>().0) {
@@ -117,8 +117,7 @@ impl Policy for FloatPolicy {
     ) {
         let modules = view.observations.len();
         memories.follow(view);
-        actions.clear();
-        actions.resize(modules, [0.0; 2]);
+        still(view, actions);
         let attention = attention.map(|weights| {
             weights.clear();
             weights.resize(modules * modules, 0.0);

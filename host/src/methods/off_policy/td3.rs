@@ -10,7 +10,7 @@ use composer_shared::observation::BASE;
 use rand::{Rng, RngExt};
 
 use super::replay::{ReplayBuffer, Transitions};
-use crate::environment::{Environment, Lesson, Outcome};
+use crate::environment::{Environment, Lesson, Outcome, with_itself};
 use crate::methods::config::TrainConfig;
 use crate::methods::on_policy::autodiff::{Seen, seen};
 use crate::methods::on_policy::collect::{ACTIONS, episode_seed};
@@ -221,12 +221,9 @@ impl<N: DeterministicActorCritic> OffPolicy<N> {
     fn step(&mut self, actor: &Weights, random: bool, rng: &mut impl Rng) -> (Transitions, Vec<Outcome>) {
         let modules = self.environments[0].modules();
         let mut new = Transitions { modules, ..Transitions::default() };
-        let heard = |view: &crate::environment::View| -> Vec<u64> {
-            view.heard.iter().enumerate().map(|(module, heard)| heard | 1 << module).collect()
-        };
         for worker in &self.environments {
             new.observations.extend(raw(&worker.view));
-            new.heard.extend(heard(&worker.view));
+            new.heard.extend(with_itself(&worker.view.heard));
         }
         new.actions = if random {
             (0..new.heard.len() * ACTIONS).map(|_| rng.random_range(-1.0..1.0)).collect()
@@ -247,7 +244,7 @@ impl<N: DeterministicActorCritic> OffPolicy<N> {
             new.rewards.push(outcome.reward);
             new.done.push(f32::from(u8::from(outcome.terminated)));
             new.next_observations.extend(raw(&worker.view));
-            new.next_heard.extend(heard(&worker.view));
+            new.next_heard.extend(with_itself(&worker.view.heard));
             if outcome.terminated || outcome.truncated {
                 worker.episode += 1;
                 worker.actions.clear();
