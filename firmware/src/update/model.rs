@@ -2,6 +2,7 @@
 
 use std::vec::Vec;
 
+use composer_shared::random::SplitMix64;
 use embedded_storage::nor_flash::{ErrorType, NorFlash, NorFlashErrorKind, ReadNorFlash};
 
 use crate::update::{PolicyFlash, SECTION, SIZE};
@@ -52,6 +53,29 @@ pub struct G4 {
     log: Vec<Op>,
     looks: u32,
     noise: u32,
+    /// Of what all words hold and how they are.
+    digest: u64,
+    /// Words that read now like this and now like that.
+    wavering: usize,
+}
+
+/// A word as it is, to be put back.
+#[derive(Clone, Copy)]
+pub struct Saved {
+    word: usize,
+    value: [u8; WORD],
+    is: Word,
+}
+
+/// The share that a word has in the digest.
+fn mark(Saved { word, value, is }: Saved) -> u64 {
+    let is = match is {
+        Word::Erased => 0,
+        Word::Written => 1,
+        Word::Torn(torn) => 2 + torn as u64,
+    };
+    let place = SplitMix64((word as u64) << 4 | is).next_u64();
+    SplitMix64(place ^ u64::from_le_bytes(value)).next_u64()
 }
 
 impl G4 {
@@ -62,7 +86,38 @@ impl G4 {
             log: Vec::new(),
             looks: 0,
             noise: 1,
+            digest: 0,
+            wavering: 0,
         }
+    }
+
+    /// Two of the same digest hold the same, as far as 64 bits can tell.
+    pub fn digest(&self) -> u64 {
+        self.digest
+    }
+
+    /// Whether a word reads now like this and now like that.
+    pub fn wavers(&self) -> bool {
+        self.wavering > 0
+    }
+
+    /// Words that waver begin with the one reading or with the other.
+    pub fn waver(&mut self, phase: u32) {
+        self.looks = phase;
+    }
+
+    /// A word as it is now.
+    pub fn save(&self, word: usize) -> Saved {
+        Saved { word, value: self.bytes[word * WORD..][..WORD].try_into().unwrap(), is: self.words[word] }
+    }
+
+    /// Makes a word as it was, or as it is to be.
+    pub fn put(&mut self, new: Saved) {
+        let wavers = |is| usize::from(is == Word::Torn(Torn::Wavering));
+        self.wavering = self.wavering + wavers(new.is) - wavers(self.words[new.word]);
+        self.digest ^= mark(self.save(new.word)) ^ mark(new);
+        self.bytes[new.word * WORD..][..WORD].copy_from_slice(&new.value);
+        self.words[new.word] = new.is;
     }
 
     /// What was done since the last call.
@@ -78,13 +133,11 @@ impl G4 {
     /// Does one operation, as it was done before.
     pub fn apply(&mut self, op: &Op) {
         match *op {
-            Op::Write { word, value } => {
-                self.bytes[word * WORD..][..WORD].copy_from_slice(&value);
-                self.words[word] = Word::Written;
-            }
+            Op::Write { word, value } => self.put(Saved { word, value, is: Word::Written }),
             Op::Erase { section } => {
-                self.bytes[section * SECTION as usize..][..SECTION as usize].fill(0xff);
-                self.words[section * SECTION_WORDS..][..SECTION_WORDS].fill(Word::Erased);
+                for word in section * SECTION_WORDS..(section + 1) * SECTION_WORDS {
+                    self.put(Saved { word, value: [0xff; WORD], is: Word::Erased });
+                }
             }
         }
     }
@@ -98,14 +151,8 @@ impl G4 {
                 for word in section * SECTION_WORDS..(section + 1) * SECTION_WORDS {
                     match self.random() % 4 {
                         0 => {}
-                        1 => {
-                            self.bytes[word * WORD..][..WORD].fill(0xff);
-                            self.words[word] = Word::Erased;
-                        }
-                        _ => {
-                            let old = self.bytes[word * WORD..][..WORD].try_into().unwrap();
-                            self.tear_word(word, old, torn);
-                        }
+                        1 => self.put(Saved { word, value: [0xff; WORD], is: Word::Erased }),
+                        _ => self.tear_word(word, self.save(word).value, torn),
                     }
                 }
             }
@@ -118,8 +165,7 @@ impl G4 {
             Torn::Blank => [0xff; WORD],
             Torn::Partly => value.map(|byte| byte | self.random() as u8),
         };
-        self.bytes[word * WORD..][..WORD].copy_from_slice(&written);
-        self.words[word] = Word::Torn(torn);
+        self.put(Saved { word, value: written, is: Word::Torn(torn) });
     }
 }
 

@@ -3,7 +3,7 @@
 use std::fmt::Write;
 use std::time::Duration;
 
-use composer_shared::wire::{LimitedBy, NOBODY};
+use composer_shared::wire::{Heartbeat, LimitedBy, NOBODY};
 use serde_json::{Value, json};
 
 use super::robot::{Change, Module, Robot, fault_name};
@@ -35,9 +35,16 @@ fn row(module: &Module, now: Duration) -> [String; 9] {
             Some(format!("{limit:?}"))
         })),
         or(module.heartbeat.map(|heartbeat| keeper(heartbeat.time_keeper))),
-        or(module.heartbeat.map(|heartbeat| format!("{:04x}", heartbeat.policy))),
+        or(module.heartbeat.map(|heartbeat| policy(&heartbeat))),
         or(module.heard.map(|heard| age(now.saturating_sub(heard)))),
     ]
+}
+
+/// The tag of its policy, and what else is to be known of it: "lab" for a module without a key, which takes any policy.
+fn policy(heartbeat: &Heartbeat) -> String {
+    let lab = if heartbeat.lab() { " lab" } else { "" };
+    let trial = if heartbeat.on_trial() { " on trial" } else { "" };
+    format!("{:04x}{lab}{trial}", heartbeat.policy)
 }
 
 fn age(age: Duration) -> String {
@@ -98,6 +105,8 @@ pub fn json_state(robot: &Robot, now: Duration) -> Value {
                 "temperature": module.telemetry.map(|telemetry| telemetry.temperature),
                 "age": module.heard.map(|heard| now.saturating_sub(heard).as_secs_f64()),
                 "policy": module.heartbeat.map(|heartbeat| format!("{:04x}", heartbeat.policy)),
+                "lab": module.heartbeat.map(|heartbeat| heartbeat.lab()),
+                "on_trial": module.heartbeat.map(|heartbeat| heartbeat.on_trial()),
                 "time_keeper": module.heartbeat.map(|heartbeat| heartbeat.time_keeper).filter(|node| *node != NOBODY),
             })
         })
@@ -131,7 +140,7 @@ mod tests {
         let ms = Duration::from_millis;
         let health = Health::SENSORS_PLAUSIBLE;
         let beat = |fault| {
-            let mode = Mode::Relaxed as u8;
+            let mode = Mode::Relaxed as u8 | Heartbeat::LAB;
             Heartbeat { mode, fault, health, time_keeper: 0, protocol: PROTOCOL_VERSION, firmware: 16, policy: 0xa1 }
         };
         robot.hear(ms(0), &Message::Sync(Sync::new(7, 2, 3)).emit(0, true));
@@ -150,7 +159,7 @@ mod tests {
         let lines: Vec<&str> = text.lines().collect();
         assert!(lines[0].starts_with("node  mode"), "{text}");
         assert!(lines[1].starts_with("0     relaxed"), "{text}");
-        for word in ["37 OverTemperature", "12.0 V", "81 C", "+1.00 -0.50", "Relaxed", "00a1", "40 ms"] {
+        for word in ["37 OverTemperature", "12.0 V", "81 C", "+1.00 -0.50", "Relaxed", "00a1 lab", "40 ms"] {
             assert!(lines[2].contains(word), "{word}: {text}");
         }
         assert!(lines[3].contains("never heard"), "{text}");
@@ -158,6 +167,7 @@ mod tests {
         let value = json_state(&robot, ms(42));
         assert_eq!((&value["modules"][1]["fault"], &value["modules"][1]["temperature"]), (&json!(37), &json!(81)));
         assert_eq!(value["modules"][2]["present"], json!(false));
+        assert_eq!((&value["modules"][1]["lab"], &value["modules"][1]["on_trial"]), (&json!(true), &json!(false)));
         robot.hear(ms(300), &Message::Sync(Sync::new(13, 2, 3)).emit(0, true));
         let gone = robot.look(ms(310));
         assert_eq!(gone.len(), 1);
