@@ -27,6 +27,7 @@ pub mod rows;
 pub mod run;
 pub mod run_folder;
 pub mod scenario;
+pub mod shard;
 pub mod side_by_side;
 pub mod signing;
 pub mod sil;

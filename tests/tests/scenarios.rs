@@ -77,13 +77,13 @@ fn a_campaign_goes_on_where_it_was_and_shards_make_the_same_file() {
     std::fs::write(path("cut.jsonl"), &whole[..whole.len() - 9]).unwrap();
     campaign(&["--out", "cut.jsonl"]);
     assert_eq!(std::fs::read_to_string(path("cut.jsonl")).unwrap(), whole);
-    for part in ["0/3", "1/3", "2/3"] {
+    for part in ["1/3", "2/3", "3/3"] {
         campaign(&["--shard", part]);
     }
-    let parts = ["runs/campaign-0-of-3.jsonl", "runs/campaign-1-of-3.jsonl", "runs/campaign-2-of-3.jsonl"];
+    let parts = ["runs/campaign-1-of-3.jsonl", "runs/campaign-2-of-3.jsonl", "runs/campaign-3-of-3.jsonl"];
     campaign(&[&["--out", "merged.jsonl", "--merge"], &parts[..]].concat());
     assert_eq!(std::fs::read_to_string(path("merged.jsonl")).unwrap(), whole);
-    refuse(folder.path(), &["campaign", "--shard", "3/3"], &["3/3", "I/N"]);
+    refuse(folder.path(), &["campaign", "--shard", "0/3"], &["no shard 0/3", "the first is 1/3"]);
     refuse(
         folder.path(),
         &["campaign", "--schedules", "24", "--seed", "4", "--out", "whole.jsonl"],

@@ -18,6 +18,7 @@ use crate::campaign::{Broken, Campaign, Schedule};
 use crate::eval::{DEFAULT_SEED, parallel};
 use crate::files::{create_folder, write_whole};
 use crate::robot::Robot;
+use crate::shard::Shard;
 use crate::train::Signals;
 
 /// Schedules between two looks at whether somebody wants to stop.
@@ -38,9 +39,9 @@ pub struct Arguments {
     /// Modules of the snake [default: the robot's]
     #[arg(long)]
     modules: Option<usize>,
-    /// Run part I of N of the schedules, I from 0
-    #[arg(long, value_name = "I/N", value_parser = shard)]
-    shard: Option<(u64, u64)>,
+    /// Run part I of N of the schedules, I from 1
+    #[arg(long, value_name = "I/N")]
+    shard: Option<Shard>,
     /// What has been run, one line a schedule; the same command goes on from there [default: runs/campaign.jsonl, of a shard runs/campaign-I-of-N.jsonl]
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
@@ -56,12 +57,6 @@ pub struct Arguments {
     /// Threads [default: one a core]; the result does not depend on it
     #[arg(long)]
     threads: Option<usize>,
-}
-
-fn shard(text: &str) -> Result<(u64, u64), String> {
-    let read = text.split_once('/').and_then(|(i, n)| Some((i.parse().ok()?, n.parse().ok()?)));
-    read.filter(|(i, n): &(u64, u64)| i < n)
-        .ok_or_else(|| format!("`{text}` is no part: write I/N with I from 0 to N - 1, such as 0/4"))
 }
 
 /// A line of the file: a schedule that has been run.
@@ -125,7 +120,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let out = match (&arguments.out, arguments.shard) {
         (Some(out), _) => out.clone(),
         (None, None) => PathBuf::from("runs/campaign.jsonl"),
-        (None, Some((i, n))) => PathBuf::from(format!("runs/campaign-{i}-of-{n}.jsonl")),
+        (None, Some(Shard { index, of })) => PathBuf::from(format!("runs/campaign-{index}-of-{of}.jsonl")),
     };
     if let Some(folder) = out.parent().filter(|folder| !folder.as_os_str().is_empty()) {
         create_folder(folder)?;
@@ -147,9 +142,8 @@ pub fn run(arguments: &Arguments) -> Result<()> {
 fn work(campaign: &Campaign<InProcess>, heading: &Heading, out: &Path, arguments: &Arguments) -> Result<Vec<Line>> {
     let mut lines = read(out, heading)?.unwrap_or_default();
     let done: BTreeSet<u64> = lines.iter().map(|line| line.number).collect();
-    let (part, parts) = arguments.shard.unwrap_or((0, 1));
-    let left: Vec<u64> =
-        (part..arguments.schedules).step_by(parts as usize).filter(|number| !done.contains(number)).collect();
+    let shard = arguments.shard.unwrap_or(Shard::WHOLE);
+    let left: Vec<u64> = shard.select(0..arguments.schedules).filter(|number| !done.contains(number)).collect();
     let bar = ProgressBar::new(left.len() as u64);
     if let Ok(style) = ProgressStyle::with_template("{msg} [{bar:40}] {pos}/{len} schedules, {eta} left") {
         bar.set_style(style);

@@ -10,13 +10,14 @@ use serde::{Deserialize, Serialize};
 
 use super::measure::{ATTENDED, Measured, Point, kept, measure};
 use super::tune::{self, Tuned};
-use super::{Comparison, Run, Shard, protocol};
+use super::{Comparison, Run, protocol};
 use crate::env::EnvConfig;
 use crate::files::{create_folder, write_whole};
 use crate::methods::Method;
 use crate::run_folder::{
     CALIBRATION_EPISODES, CONFIG_FILE, NETWORK_FILE, alone, begun, freeze_run, load_config, load_run, trained,
 };
+use crate::shard::Shard;
 use crate::side_by_side::side_by_side;
 use crate::train::checkpoint;
 
@@ -157,7 +158,7 @@ pub fn work(
     create_folder(out)?;
     pieces.extend(comparison.tasks.iter().map(|task| Piece::Robust(*task)));
     if let Some(shard) = shard {
-        pieces = shard.select(pieces);
+        pieces = shard.select(pieces).collect();
     }
     let folder = |piece: &Piece| match piece {
         Piece::Run(run) => run.folder(out),

@@ -11,7 +11,8 @@ use crate::paper::gather::gather;
 use crate::paper::publish::publish;
 use crate::paper::tune::{FILE, Tuned};
 use crate::paper::work::{tune, work};
-use crate::paper::{Comparison, Shard, protocol};
+use crate::paper::{Comparison, protocol};
+use crate::shard::Shard;
 
 /// Arguments of `report paper`.
 #[derive(clap::Args, Clone, Debug)]
