@@ -138,11 +138,6 @@ pub fn common_grid(runs: &[Vec<(f64, f64)>], count: usize) -> Vec<f64> {
     (0..count).map(|i| if i + 1 == count { end } else { start + step * i as f64 }).collect()
 }
 
-/// One panel of curves.
-pub fn learning_curves(series: &[Series], axes: &Axes) -> String {
-    panels(&[Panel { axes: axes.clone(), series: series.to_vec() }])
-}
-
 const WIDTH: f64 = 400.0;
 const HEIGHT: f64 = 300.0;
 /// Room round the plot area: left, right, top, bottom.
@@ -385,6 +380,10 @@ viewBox="0 0 {width:.0} {height:.0}" font-size="13" fill="#222"><rect width="100
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn learning_curves(series: &[Series], axes: &Axes) -> String {
+        panels(&[Panel { axes: axes.clone(), series: series.to_vec() }])
+    }
 
     #[test]
     fn mean_and_standard_error_over_runs() {

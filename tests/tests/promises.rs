@@ -4,7 +4,7 @@ mod common;
 
 use std::path::Path;
 
-use common::{json, refuse, succeed};
+use common::{json, succeed};
 use composer_shared::policies;
 use composer_shared::policy::{Policy, Task};
 
@@ -142,36 +142,6 @@ fn the_demonstration_prints_a_table_and_writes_a_page_and_a_capture_is_a_candump
     assert!(log.lines().count() > 500);
     let dbc = succeed(folder.path(), &["dbc"]);
     assert!(dbc.contains("BO_ ") && dbc.contains("VFrameFormat"), "{dbc}");
-}
-
-#[test]
-fn a_comparison_is_made_from_nothing_and_what_is_done_is_not_done_again() {
-    let folder = tempfile::tempdir().unwrap();
-    let report = |steps| {
-        ["report", "attention", "--steps", steps, "--seeds", "1", "--episodes", "2", "--runs", "r", "--out", "o"]
-    };
-    refuse(folder.path(), &[&report("2048")[..], &["--so-far"]].concat(), &["none of the 4 runs in r is done"]);
-    let table = succeed(folder.path(), &report("2048"));
-    for method in ["| composer-neither |", "| composer-no-imagination |"] {
-        assert_eq!(table.matches(method).count(), 2, "{table}");
-    }
-    let read = |name: &str| std::fs::read_to_string(folder.path().join("o").join(name)).unwrap();
-    assert!(read("learning-curves.svg").contains("composer-no-imagination") && table.contains(&read("table.md")));
-    let runs: serde_json::Value = serde_json::from_str(&read("runs.json")).unwrap();
-    for run in runs.as_array().unwrap() {
-        assert_eq!(run["curve"][1][0], 2048.0, "{run}");
-        assert_eq!(run["final"]["none"]["episodes"], 2, "{run}");
-    }
-    // A run that was killed before its judgement ended is judged again and comes to the same.
-    let run = folder.path().join("r/composer-neither-head-1");
-    let (result, metrics) = (std::fs::read(run.join("result.json")).unwrap(), std::fs::read(run.join("metrics.jsonl")));
-    std::fs::remove_file(run.join("result.json")).unwrap();
-    let so_far = succeed(folder.path(), &[&report("2048")[..], &["--so-far"]].concat());
-    assert!(so_far.contains("3 of 4 runs are done") && so_far.matches("| composer-neither |").count() == 1, "{so_far}");
-    assert_eq!(succeed(folder.path(), &report("2048")), table);
-    assert_eq!(std::fs::read(run.join("result.json")).unwrap(), result);
-    assert_eq!(std::fs::read(run.join("metrics.jsonl")).unwrap(), metrics.unwrap());
-    refuse(folder.path(), &report("4096"), &["holds a run with other settings", "--runs"]);
 }
 
 #[test]

@@ -18,7 +18,7 @@
 //!   `r_f = -follow * mean_i |p_{i,t+1} - p'_{i,t}|`, a mean, so that the weight holds for any number of modules.
 //! - Where the text and Algorithm 1 give the imagination policy the control policy's parameters theta, its own (psi) are meant.
 //!
-//! Measured (`snakectl report ablation`, README): it learns to point straight at the goal within some 50,000 steps, which a snake cannot
+//! Measured (`snakectl report paper`, README): it learns to point straight at the goal within some 50,000 steps, which a snake cannot
 //! follow and which the `progress` reward says too; at `follow` 0.1 it makes no difference, at 1 and above learning is slower.
 //!
 //! Settings for variants that may do better stand in [`ImaginationConfig`]; [`crate::study`] compares them (`snakectl report imagination`).

@@ -11,11 +11,14 @@ use serde_json::Value;
 use super::measure::{Attended, Cell, Measured, Point, kept};
 use super::work::{Progress, attends, policy_digest, progress, robust, robust_name};
 use super::{Comparison, Run};
+use crate::plot::mean_and_error;
 use crate::run_folder::{load_run, metrics};
 use crate::stats::{Line, weighted_line};
 
 /// Share of a run at whose end the slope of its curve is taken.
 const LAST: f64 = 0.2;
+/// Metrics of the imagination policy: its reward, and how far the modules are from where it wanted them.
+const IMAGINATION: [&str; 2] = ["imagination/reward", "imagination/follow_error"];
 
 /// What came of a policy.
 #[derive(Clone, Debug, Serialize)]
@@ -34,6 +37,9 @@ pub struct Outcome {
     pub curve: Vec<(f64, f64)>,
     /// Success of the training's own episodes, with their noise, in the last fifth of the run: at its end, and how much it rose in 100,000 steps.
     pub end: Option<Line>,
+    /// Of the imagination policy in the last tenth of the run, in units a control step: by how much nearer to the goal it imagines the modules, and by how much they miss
+    /// where it imagines them.
+    pub imagined: Option<[f64; 2]>,
     /// The points of the tables, by their names.
     pub cells: BTreeMap<String, Cell>,
     /// Why there is nothing on the bus, if there is not.
@@ -94,6 +100,19 @@ fn end(metrics: &[Value]) -> Option<Line> {
         Some((at, line["charts/success_rate"].as_f64()?, episodes))
     });
     weighted_line(&points.filter(|point| point.0 >= -LAST * last / 1e5).collect::<Vec<_>>())
+}
+
+/// Mean of a metric over the last tenth of a run; none if it has no such metric.
+fn at_the_end(metrics: &[Value], key: &str) -> Option<f64> {
+    let last = metrics.len().div_ceil(10);
+    let values: Vec<f64> = metrics[metrics.len() - last..].iter().filter_map(|line| line[key].as_f64()).collect();
+    (!values.is_empty()).then(|| mean_and_error(&values).0)
+}
+
+/// What the imagination policy came to, if there is one.
+fn imagined(metrics: &[Value]) -> Option<[f64; 2]> {
+    let [reward, missed] = IMAGINATION.map(|key| at_the_end(metrics, key));
+    Some([reward?, missed?])
 }
 
 /// The output that holds a run to its end, if one does.
@@ -160,6 +179,7 @@ pub fn gather(comparison: &Comparison, outs: &[PathBuf], episodes: u64, so_far: 
             environment_steps: config.train.total_steps,
             curve: curve(&log),
             end: end(&log),
+            imagined: imagined(&log),
             cells: BTreeMap::new(),
             not_on_the_bus,
             attention: measured.found_attention().filter(|_| attends).flatten(),
@@ -187,6 +207,7 @@ pub fn gather(comparison: &Comparison, outs: &[PathBuf], episodes: u64, so_far: 
             environment_steps: 0,
             curve: Vec::new(),
             end: None,
+            imagined: None,
             cells: BTreeMap::new(),
             not_on_the_bus: None,
             attention: None,

@@ -159,6 +159,7 @@ impl Results {
             sections.push(self.table("Table III as integer controllers on the bus", &lengths, true));
         }
         sections.push(self.bus());
+        sections.extend(self.imagination());
         sections.extend(self.comparison.tuned.as_ref().map(|tuned| self.tuned(tuned)));
         sections
     }
@@ -393,6 +394,31 @@ impl Results {
             head: std::iter::once("tuned".into()).chain(tasks.iter().map(|task| task.title().into())).collect(),
             rows,
         }
+    }
+
+    /// What the imagination policies came to; none without any.
+    fn imagination(&self) -> Option<Section> {
+        let mut rows = Vec::new();
+        for &task in &self.comparison.tasks {
+            let imagined: Vec<[f64; 2]> =
+                self.of(Method::Composer, task).iter().filter_map(|run| run.imagined).collect();
+            if !imagined.is_empty() {
+                let column = |k: usize| {
+                    spread(&imagined.iter().map(|of| of[k]).collect::<Vec<_>>(), 3, self.comparison.seeds.len())
+                };
+                rows.push(vec![task.title().into(), column(0), column(1)]);
+            }
+        }
+        let bound = crate::methods::imagination::ImaginationConfig::default().bound;
+        (!rows.is_empty()).then(|| Section {
+            title: "What is imagined".into(),
+            text: vec![format!(
+                "COMPOSER's imagination policies in the last tenth of training, in units a control step: the imagined step is at most {bound} long; the \
+                 imagined modules come nearer to where the task wants them by the first number, and the real ones are away from the imagined ones by the second."
+            )],
+            head: ["task", "comes nearer by", "missed by the modules by"].map(Into::into).to_vec(),
+            rows,
+        })
     }
 
     fn bus(&self) -> Section {
