@@ -20,6 +20,7 @@
 //! | `panic` | nothing panics |
 
 use std::fmt;
+use std::io::Write;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::str::FromStr;
 use std::sync::Arc;
@@ -286,12 +287,26 @@ impl<L: Launcher + Sync> Campaign<'_, L> {
     ///
     /// If it cannot run at all.
     pub fn run(&self, schedule: &Schedule, number: u64) -> anyhow::Result<Option<Broken>> {
+        self.run_captured(schedule, number, None)
+    }
+
+    /// The same, with all frames of the bus written as a candump log.
+    ///
+    /// # Errors
+    ///
+    /// If it cannot run at all, or if the log cannot be written.
+    pub fn run_captured(
+        &self,
+        schedule: &Schedule,
+        number: u64,
+        capture: Option<&mut dyn Write>,
+    ) -> anyhow::Result<Option<Broken>> {
         let seed = episode_seed(self.seed, number);
         let sil = schedule.sil(seed, self.config.robot.modules);
         let mut plant = Watched::new(SnakePlant::new(self.config.clone(), seed), &self.config, &sil);
         let mut rules = Rules::new(&self.config, &sil);
         let run = catch_unwind(AssertUnwindSafe(|| {
-            sil::run_on(self.launcher, &mut plant, self.policy, &sil, None, &mut |view, plant: &Watched| {
+            sil::run_on(self.launcher, &mut plant, self.policy, &sil, capture, &mut |view, plant: &Watched| {
                 if rules.broken.is_none() {
                     rules.broken.clone_from(&plant.broken);
                 }

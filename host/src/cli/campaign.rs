@@ -54,6 +54,9 @@ pub struct Arguments {
     /// The number that it was drawn with
     #[arg(long)]
     number: Option<u64>,
+    /// Write all frames of that schedule, as a candump log
+    #[arg(long, value_name = "FILE", requires = "schedule")]
+    capture: Option<PathBuf>,
     /// Threads [default: one a core]; the result does not depend on it
     #[arg(long)]
     threads: Option<usize>,
@@ -102,7 +105,16 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let campaign = Campaign { config: config.clone(), policy, launcher: &launcher, seed: arguments.seed };
     if let (Some(schedule), Some(number)) = (&arguments.schedule, arguments.number) {
         schedule.check(config.robot.modules)?;
-        return match campaign.run(schedule, number)? {
+        let broken = match &arguments.capture {
+            None => campaign.run(schedule, number)?,
+            Some(path) => {
+                let mut log = Vec::new();
+                let broken = campaign.run_captured(schedule, number, Some(&mut log))?;
+                write_whole(path, &log)?;
+                broken
+            }
+        };
+        return match broken {
             None => {
                 println!("no rule is broken");
                 Ok(())
