@@ -10,6 +10,7 @@ use composer_host::methods::normalise::{Forgetting, ValueNorm};
 use composer_host::methods::off_policy::{DeterministicActorCritic, Td3, Td3Settings, Transitions};
 use composer_host::methods::on_policy::autodiff::{Autodiff, Evaluation, TensorNetworks, seen};
 use composer_host::methods::on_policy::losses::{entropy, log_density, value_loss};
+use composer_host::methods::on_policy::taped::{Taped, TapedNetworks};
 use composer_host::methods::on_policy::{
     ActorCritic, Batch, Decisions, Gradient, LossSettings, Part, Teams, Trajectory, Valued,
 };
@@ -60,17 +61,12 @@ fn scored<N: TensorNetworks>(
 }
 
 /// What a policy draws with this noise, and the densities of that.
-fn drawn<N: TensorNetworks>(
-    networks: &Autodiff<N>,
-    observations: &[f32],
-    noise: &[f32],
-    modules: usize,
-) -> [Vec<f32>; 2] {
+fn drawn(networks: &impl ActorCritic, observations: &[f32], noise: &[f32], modules: usize) -> [Vec<f32>; 2] {
     let (mut actions, mut densities) = (Vec::new(), Vec::new());
     let teams = observations.len() / 40 / modules;
     let (heard, modules) = (heard(teams, modules), vec![modules; teams]);
     let seen = Teams { observations, privileged: &[], heard: &heard, modules: &modules };
-    networks.sample(seen, noise, &mut (), &mut actions, &mut densities);
+    networks.sample(seen, noise, &mut Default::default(), &mut actions, &mut densities);
     [actions, densities]
 }
 
@@ -165,15 +161,21 @@ fn compare_step(
 }
 
 /// What MAT and MAT_dec have in common.
-fn mat_family<N: TensorNetworks>(fixture: &Fixture, method: N) {
-    let networks = networks(fixture, method);
+fn mat_family<N: TapedNetworks>(fixture: &Fixture, method: N) {
+    let networks = Taped::new(method.clone(), parameters(fixture, &method.layout()));
+    // Means, values and densities of given actions.
+    let scored = |observations: &[f32], actions: &[f32], modules: usize| {
+        let teams = observations.len() / 40 / modules;
+        let (heard, modules) = (heard(teams, modules), vec![modules; teams]);
+        networks.evaluate(Teams { observations, privileged: &[], heard: &heard, modules: &modules }, actions)
+    };
     let (observations, actions) = (fixture.get("in.obs"), fixture.get("in.actions"));
-    let (evaluation, densities) = scored(&networks, &observations, &actions, 8);
-    same("action_mean", &floats(evaluation.means), &fixture.get("out.action_mean"), OUTPUT);
-    same("action_std", &floats(evaluation.sigma.clone()), &fixture.get("out.action_std"), OUTPUT);
-    same("values", &floats(evaluation.values), &fixture.get("out.values"), OUTPUT);
+    let [means, values, densities] = scored(&observations, &actions, 8);
+    same("action_mean", &means, &fixture.get("out.action_mean"), OUTPUT);
+    same("action_std", &networks.sigma(), &fixture.get("out.action_std"), OUTPUT);
+    same("values", &values, &fixture.get("out.values"), OUTPUT);
     same("log_probs", &densities, &fixture.get("out.log_probs"), OUTPUT);
-    let entropy = floats(entropy(evaluation.sigma));
+    let entropy: Vec<f32> = networks.log_sigma().iter().map(|l| l + 1.418_938_5).collect();
     same("entropy", &entropy, &fixture.get("out.entropy")[..2], OUTPUT);
     // The means, one after the other, and with noise; scored in one pass they have the densities that they were drawn with.
     let [deterministic, of_deterministic] = drawn(&networks, &observations, &[0.0; 48], 8);
@@ -182,16 +184,22 @@ fn mat_family<N: TensorNetworks>(fixture: &Fixture, method: N) {
     let [sampled, of_sampled] = drawn(&networks, &observations, &fixture.get("ar_smp.noise"), 8);
     same("ar_smp.actions", &sampled, &fixture.get("ar_smp.actions"), OUTPUT);
     same("ar_smp.log_probs", &of_sampled, &fixture.get("ar_smp.log_probs"), OUTPUT);
-    same("scored", &scored(&networks, &observations, &sampled, 8).1, &of_sampled, OUTPUT);
+    same("scored", &scored(&observations, &sampled, 8)[2], &of_sampled, OUTPUT);
     for modules in [6, 11] {
         let of = |name: &str| fixture.get(&format!("n{modules}.{name}"));
-        let (evaluation, densities) = scored(&networks, &of("in.obs"), &of("in.actions"), modules);
-        same("values", &floats(evaluation.values), &of("out.values"), OUTPUT);
+        let [_, values, densities] = scored(&of("in.obs"), &of("in.actions"), modules);
+        same("values", &values, &of("out.values"), OUTPUT);
         same("log_probs", &densities, &of("out.log_probs"), OUTPUT);
         let [deterministic, _] = drawn(&networks, &of("in.obs"), &vec![0.0; 4 * modules], modules);
         same("ar_det.actions", &deterministic, &of("ar_det.actions"), OUTPUT);
     }
 
+    let gradients = |networks: &Taped<N>, batch: &Batch, loss: LossSettings| {
+        let mut sum = Gradient::default();
+        sum.clear(networks.layout().len());
+        networks.gradient(batch, loss, &mut Default::default(), Some(&mut sum), None);
+        sum
+    };
     let mut norm = value_norm(fixture);
     let mut batch = batch(fixture, "in.obs", "in.actions", 8);
     batch.log_probabilities = fixture.get("upd.in.old_log_probs");
@@ -199,7 +207,7 @@ fn mat_family<N: TensorNetworks>(fixture: &Fixture, method: N) {
     batch.values = fixture.get("upd.in.value_preds");
     batch.targets = fixture.get("upd.in.returns").iter().map(|r| norm.normalise(*r)).collect();
     let loss = LossSettings { clip: 0.05, entropy: 0.001, team_weight: 1.0 / 3.0 };
-    let [sum, _] = gradients(&networks, &batch, loss);
+    let sum = gradients(&networks, &batch, loss);
     let layout = networks.layout();
     let step = |step: usize, name: &str| f64::from(fixture.get(&format!("upd.step{step}.{name}"))[0]);
     let close = |name: &str, found: f64, expected: f64, tolerance: f64| {
@@ -219,7 +227,7 @@ fn mat_family<N: TensorNetworks>(fixture: &Fixture, method: N) {
     after.load(Part::Actor, &weights);
     norm.update(&fixture.get("upd.in.returns"));
     batch.targets = fixture.get("upd.in.returns").iter().map(|r| norm.normalise(*r)).collect();
-    let [sum, _] = gradients(&after, &batch, loss);
+    let sum = gradients(&after, &batch, loss);
     close("step 2 policy_loss", sum.policy_loss, step(2, "policy_loss"), 1e-3);
     close("step 2 value_loss", sum.value_loss, step(2, "value_loss"), 1e-3);
 }

@@ -52,6 +52,12 @@ enum What {
         #[arg(long, default_value_t = 5.0)]
         seconds: f64,
     },
+    /// Measure learning alone, with environments that cost nothing.
+    Learning {
+        /// Seconds for each figure
+        #[arg(long, default_value_t = 5.0)]
+        seconds: f64,
+    },
 }
 
 /// Control steps per second over all threads.
@@ -103,35 +109,66 @@ fn training(config: &RunConfig, seconds: f64) -> Result<Times> {
 
 /// One way to learn, and what its iterations took.
 struct Learning {
-    gradient: Differentiation,
+    name: String,
     threads: usize,
     trainer: Trainer,
     /// Milliseconds for inference and for the update of 2,048 environment steps.
     milliseconds: Vec<[f64; 2]>,
 }
 
-/// Learning with environments that cost nothing, for each way to the gradient on one thread and on all. They take turns, so that other
-/// load on the machine slows all of them alike.
+/// What is measured of learning: COMPOSER's two ways to the gradient, and baselines, in shorter iterations with minibatches of the size that
+/// they have.
+fn ways() -> Vec<(String, TrainConfig)> {
+    let composer = [Differentiation::Manual, Differentiation::Automatic].map(|gradient| {
+        let name = format!("composer, {}", format!("{gradient:?}").to_lowercase());
+        (name, TrainConfig { gradient, ..TrainConfig::default() })
+    });
+    let baselines = [Method::Mat, Method::MatDec, Method::Smp].map(|method| {
+        let mut config = TrainConfig { method, ..TrainConfig::default() };
+        (config.mat.environments, config.mat.minibatches) = (8, 8);
+        (config.mat_dec.environments, config.mat_dec.minibatches) = (8, 8);
+        (config.smp.rollout_steps, config.smp.random_steps) = (4, 0);
+        (method.name().to_owned(), config)
+    });
+    composer.into_iter().chain(baselines).collect()
+}
+
+/// Learning with environments that cost nothing, each way on one thread and on all. They take turns, so that other load on the machine slows
+/// all of them alike.
 fn learning(modules: usize, cores: usize, seconds: f64) -> Result<Vec<Learning>> {
     let make = |_: usize| -> Result<Box<dyn Environment>> { Ok(Box::new(Trivial::new(modules, Told::Head))) };
-    let mut ways = Vec::new();
-    for gradient in [Differentiation::Manual, Differentiation::Automatic] {
+    let mut learning = Vec::new();
+    for (name, config) in ways() {
         for threads in if cores > 1 { vec![1, cores] } else { vec![1] } {
-            let config = TrainConfig { gradient, threads, ..TrainConfig::default() };
+            let config = TrainConfig { threads, ..config.clone() };
             let mut trainer = Trainer::new(&config, &make, "benchmark")?;
             trainer.iterate()?;
-            ways.push(Learning { gradient, threads, trainer, milliseconds: Vec::new() });
+            learning.push(Learning { name: name.clone(), threads, trainer, milliseconds: Vec::new() });
         }
     }
     let start = Instant::now();
-    while start.elapsed().as_secs_f64() < seconds * ways.len() as f64 || ways[0].milliseconds.len() < 3 {
-        for way in &mut ways {
+    while start.elapsed().as_secs_f64() < seconds * learning.len() as f64 || learning[0].milliseconds.len() < 3 {
+        for way in &mut learning {
             let times = way.trainer.iterate()?.times;
             let of = |part: Duration| 1e3 * part.as_secs_f64() * 2048.0 / times.steps as f64;
-            way.milliseconds.push([of(times.inference), of(times.update)]);
+            way.milliseconds.push([of(times.wall.saturating_sub(times.update)), of(times.update)]);
         }
     }
-    Ok(ways)
+    Ok(learning)
+}
+
+/// The table of learning.
+fn learnings(modules: usize, cores: usize, seconds: f64) -> Result<()> {
+    println!("\nlearning alone, {modules} modules, ms for 2,048 environment steps: median (least)");
+    println!("{:>20} {:>8} {:>16} {:>16}", "method", "threads", "inference", "update");
+    for mut way in learning(modules, cores, seconds)? {
+        let [inference, update] = [0, 1].map(|part| {
+            way.milliseconds.sort_by(|a, b| a[part].total_cmp(&b[part]));
+            format!("{:.0} ({:.0})", way.milliseconds[way.milliseconds.len() / 2][part], way.milliseconds[0][part])
+        });
+        println!("{:>20} {:>8} {inference:>16} {update:>16}", way.name, way.threads);
+    }
+    Ok(())
 }
 
 /// How fast complete controllers run on the bus.
@@ -239,6 +276,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     match &arguments.what {
         Some(What::Firmware(arguments)) => return firmware::run(arguments),
         Some(What::Bus { seconds }) => return buses(&Robot::default(), *seconds),
+        Some(What::Learning { seconds }) => return learnings(Robot::default().modules, super::cores(), *seconds),
         None => {}
     }
     let seconds = arguments.seconds;
@@ -276,18 +314,6 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             times.steps_per_second()
         );
     }
-    println!("\nlearning alone, {} modules, ms for 2,048 environment steps: median (least)", robot.modules);
-    println!("{:>12} {:>8} {:>16} {:>16}", "gradient", "threads", "inference", "update");
-    for mut way in learning(robot.modules, cores, seconds)? {
-        let [inference, update] = [0, 1].map(|part| {
-            way.milliseconds.sort_by(|a, b| a[part].total_cmp(&b[part]));
-            format!("{:.0} ({:.0})", way.milliseconds[way.milliseconds.len() / 2][part], way.milliseconds[0][part])
-        });
-        println!(
-            "{:>12} {:>8} {inference:>16} {update:>16}",
-            format!("{:?}", way.gradient).to_lowercase(),
-            way.threads
-        );
-    }
+    learnings(robot.modules, cores, seconds)?;
     buses(&robot, seconds)
 }

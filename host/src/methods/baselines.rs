@@ -11,8 +11,9 @@ use super::mat_dec::MatDec;
 use super::normalise::{Forgetting, ValueNorm};
 use super::on_policy::autodiff::{Autodiff, TensorNetworks, seen};
 use super::on_policy::collect::ACTIONS;
+use super::on_policy::taped::{Scratch, Taped, TapedNetworks};
 use super::on_policy::update::Standardise;
-use super::on_policy::{Learner, OnPolicy, OnPolicySettings};
+use super::on_policy::{ActorCritic, Learner, OnPolicy, OnPolicySettings, Teams};
 use super::ppo::{self, Ppo};
 use super::random::{Stream, stream};
 use super::smp::SmpPolicy;
@@ -183,6 +184,13 @@ pub fn learner<N: TensorNetworks>(networks: N, seed: u64, forgetting: Forgetting
     Learner::new(Autodiff::new(networks), seed, actor, critic, ValueNorm::new(forgetting), 1e-5, rate as f32)
 }
 
+/// The same of networks on a tape, which have one optimiser.
+pub fn taped_learner<N: TapedNetworks>(networks: N, seed: u64, rate: f64) -> Learner<Taped<N>> {
+    let initial = networks.layout().initial(&mut stream(seed, Stream::Weights, 2, 0));
+    let (networks, value_norm) = (Taped::new(networks, initial.clone()), ValueNorm::new(Forgetting::Minibatches));
+    Learner::new(networks, seed, initial, Vec::new(), value_norm, 1e-5, rate as f32)
+}
+
 /// The modules that all environments have, for a method whose critic is made for a number of them.
 fn one_length(environments: usize, make: MakeEnvironment, method: Method) -> Result<usize> {
     let first = checked(make(0)?, 0)?.modules();
@@ -227,13 +235,13 @@ pub fn mappo(config: &TrainConfig, make: MakeEnvironment) -> Result<Box<dyn Algo
 
 /// A run of MAT.
 pub fn mat(config: &TrainConfig, make: MakeEnvironment) -> Result<Box<dyn Algorithm>> {
-    let learner = learner(Mat, config.seed, Forgetting::Minibatches, config.mat.learning_rate);
+    let learner = taped_learner(Mat, config.seed, config.mat.learning_rate);
     Ok(Box::new(OnPolicy::new(config, config.mat.on_policy(), learner, None, make)?))
 }
 
 /// A run of MAT_dec.
 pub fn mat_dec(config: &TrainConfig, make: MakeEnvironment) -> Result<Box<dyn Algorithm>> {
-    let learner = learner(MatDec, config.seed, Forgetting::Minibatches, config.mat_dec.learning_rate);
+    let learner = taped_learner(MatDec, config.seed, config.mat_dec.learning_rate);
     Ok(Box::new(OnPolicy::new(config, config.mat_dec.on_policy(), learner, None, make)?))
 }
 
@@ -287,8 +295,8 @@ impl SavedWeights {
         let expected = match self.method {
             Method::Ppo => parameters_of(&Ppo { modules: self.modules }),
             Method::Mappo => parameters_of(&Mappo::harl(self.modules)),
-            Method::Mat => parameters_of(&Mat),
-            Method::MatDec => parameters_of(&MatDec),
+            Method::Mat => Mat.layout().len(),
+            Method::MatDec => MatDec.layout().len(),
             Method::Smp if SmpPolicy::new(self).is_some() => self.parameters.len(),
             method => bail!("its parameters are none of {method}"),
         };
@@ -306,8 +314,8 @@ impl SavedWeights {
         match self.method {
             Method::Ppo => self.with(Ppo { modules: self.modules }),
             Method::Mappo => self.with(Mappo::harl(self.modules)),
-            Method::Mat => self.with(Mat),
-            Method::MatDec => self.with(MatDec),
+            Method::Mat => Box::new(TapedPolicy::new(self, Mat)),
+            Method::MatDec => Box::new(TapedPolicy::new(self, MatDec)),
             Method::Smp => match SmpPolicy::new(self) {
                 Some(policy) => Box::new(policy),
                 None => Box::new(crate::policy::Still),
@@ -365,14 +373,46 @@ impl<N: TensorNetworks> Policy for TensorPolicy<'_, N> {
     }
 }
 
+/// The same on a tape.
+pub struct TapedPolicy<'a, N> {
+    saved: &'a SavedWeights,
+    networks: Taped<N>,
+}
+
+impl<'a, N: TapedNetworks> TapedPolicy<'a, N> {
+    /// With the weights that were saved of them.
+    pub fn new(saved: &'a SavedWeights, networks: N) -> Self {
+        Self { saved, networks: Taped::new(networks, saved.parameters.clone()) }
+    }
+}
+
+impl<N: TapedNetworks> Policy for TapedPolicy<'_, N> {
+    fn act(
+        &self,
+        view: &View,
+        _noise: u64,
+        _memories: &mut Memories,
+        actions: &mut Vec<[f32; 2]>,
+        _attention: Option<&mut Vec<f32>>,
+    ) {
+        let modules = view.observations.len();
+        let (observations, heard) = (self.saved.normalised(view), with_itself(&view.heard).collect::<Vec<u64>>());
+        let teams = Teams { observations: &observations, privileged: &[], heard: &heard, modules: &[modules] };
+        let (mut means, mut densities) = (Vec::new(), Vec::new());
+        let noise = vec![0.0; modules * ACTIONS];
+        self.networks.sample(teams, &noise, &mut Scratch::default(), &mut means, &mut densities);
+        actions.clear();
+        actions.extend_from_slice(means.as_chunks::<ACTIONS>().0);
+    }
+}
+
 #[cfg(test)]
 mod tests {
+    use super::super::tensors::Layout;
     use super::*;
 
     /// Gains of the initial matrices by the end of their names; the biases are zeros.
-    fn gains<N: TensorNetworks>(networks: N, expected: &[(&str, f32)], other: f32) {
-        let learner = learner(networks, 3, Forgetting::Off, 1e-3);
-        let (layout, parameters) = (learner.networks.layout(), learner.networks.parameters());
+    fn gains(layout: &Layout, parameters: &[f32], expected: &[(&str, f32)], other: f32) {
         for entry in layout.entries().iter().filter(|entry| entry.rows > 1) {
             // All singular values of an orthogonal matrix times a gain are the gain.
             let square: f32 = parameters[entry.range()].iter().map(|w| w * w).sum();
@@ -394,11 +434,16 @@ mod tests {
     fn initial_weights_have_the_authors_gains() {
         let root2 = std::f32::consts::SQRT_2;
         let small = ["query", "key", "value", "proj", "mlp.2", "decoder.head.3"].map(|name| (name, 0.01));
-        gains(Mat, &small, root2);
-        gains(MatDec, &[&small[..], &[("decoder.mlp.7", 0.01)]].concat(), root2);
+        let Learner { networks, .. } = taped_learner(Mat, 3, 1e-3);
+        gains(networks.layout(), networks.parameters(), &small, root2);
+        let Learner { networks, .. } = taped_learner(MatDec, 3, 1e-3);
+        let more = [&small[..], &[("decoder.mlp.7", 0.01)]].concat();
+        gains(networks.layout(), networks.parameters(), &more, root2);
         for networks in [Mappo::harl(8), Mappo::on_policy(8)] {
-            gains(networks, &[("fc_mean", 0.01)], root2);
+            let Learner { networks, .. } = learner(networks, 3, Forgetting::Off, 1e-3);
+            gains(networks.layout(), networks.parameters(), &[("fc_mean", 0.01)], root2);
         }
-        gains(Ppo { modules: 11 }, &[("actor_mean.4", 0.01)], root2);
+        let Learner { networks, .. } = learner(Ppo { modules: 11 }, 3, Forgetting::Off, 1e-3);
+        gains(networks.layout(), networks.parameters(), &[("actor_mean.4", 0.01)], root2);
     }
 }

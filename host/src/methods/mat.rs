@@ -19,23 +19,18 @@
 //! The order is head to tail. A module that is not heard is masked in every attention; later ones are still told the action of one whose
 //! motors are dead.
 
-use burn::tensor::Tensor;
-use burn::tensor::activation::sigmoid;
 use composer_shared::observation::BASE;
 
-use super::on_policy::autodiff::{Evaluation, Seen, TensorNetworks};
+use super::layers::{Matrix, Network, Past, Query, Tape};
 use super::on_policy::collect::ACTIONS;
-use super::on_policy::losses::{ValueLoss, log_density};
-use super::on_policy::{Ratio, Valued};
-use super::tensors::{Activation, Layout, Scheme, Weights};
+use super::on_policy::taped::{LOG_STD, Seen, TapedNetworks, draw};
+use super::tensors::{Activation, Layout, Scheme};
 use super::{Method, SavedWeights, TrainedPolicy};
 
 /// Width of everything.
 pub const WIDTH: usize = 64;
 /// Gains of the initial weights: in front of an activation, and at an output.
 pub const GAINS: [f32; 2] = [std::f32::consts::SQRT_2, 0.01];
-/// Added to the score of a module that comes later.
-const LATER: f32 = -1e9;
 
 /// Encoder and decoder.
 #[derive(Clone, Copy, Debug, Default)]
@@ -54,6 +49,12 @@ fn feed_forward(layout: &mut Layout, name: &str) {
     layout.linear(&format!("{name}.2"), WIDTH, WIDTH, Scheme::Orthogonal(GAINS[1]));
 }
 
+/// The output of a feed-forward step.
+fn forward(t: &mut Tape, w: Network, name: &str, x: Matrix) -> Matrix {
+    let x = t.activated(w, &format!("{name}.0"), Activation::Gelu, x);
+    t.linear(w, &format!("{name}.2"), x)
+}
+
 /// The layers of a head with so many outputs.
 fn head(layout: &mut Layout, name: &str, outputs: usize) {
     layout.linear(&format!("{name}.0"), WIDTH, WIDTH, Scheme::Orthogonal(GAINS[0]));
@@ -62,9 +63,10 @@ fn head(layout: &mut Layout, name: &str, outputs: usize) {
 }
 
 /// The output of a head.
-fn through_head(w: &Weights, name: &str, x: Tensor<2>) -> Tensor<2> {
-    let x = Activation::Gelu.apply(w.linear(&format!("{name}.0"), x));
-    w.linear(&format!("{name}.3"), w.layer_norm(&format!("{name}.2"), x))
+fn through_head(t: &mut Tape, w: Network, name: &str, x: Matrix) -> Matrix {
+    let x = t.activated(w, &format!("{name}.0"), Activation::Gelu, x);
+    let x = t.norm(w, &format!("{name}.2"), x);
+    t.linear(w, &format!("{name}.3"), x)
 }
 
 /// Adds the layers of the encoder.
@@ -79,134 +81,113 @@ pub fn encoder_layout(layout: &mut Layout) {
     head(layout, "encoder.head", 1);
 }
 
-/// What the encoder makes of the observations, and the values: `[rows, WIDTH]` and `[rows, 1]`.
-pub fn encode(w: &Weights, seen: &Seen) -> (Tensor<2>, Tensor<2>) {
-    let x = w.layer_norm("encoder.obs_encoder.0", seen.observations.clone());
-    let x = Activation::Gelu.apply(w.linear("encoder.obs_encoder.1", x));
-    let x = w.layer_norm("encoder.ln", x);
-    let attended = w.attention("encoder.blocks.0.attn", x.clone(), x.clone(), seen.mask.clone());
-    let x = w.layer_norm("encoder.blocks.0.ln1", x + attended);
-    let forward = w.mlp(&["encoder.blocks.0.mlp.0", "encoder.blocks.0.mlp.2"], Activation::Gelu, x.clone());
-    let x = w.layer_norm("encoder.blocks.0.ln2", x + forward);
-    let values = through_head(w, "encoder.head", x.clone());
-    (x, values)
+/// What the encoder makes of the observations, `[rows, WIDTH]`.
+fn encode(t: &mut Tape, w: Network, seen: &Seen) -> Matrix {
+    let x = t.norm(w, "encoder.obs_encoder.0", seen.observations);
+    let x = t.activated(w, "encoder.obs_encoder.1", Activation::Gelu, x);
+    let x = t.norm(w, "encoder.ln", x);
+    let attended = t.attention(w, "encoder.blocks.0.attn", x, x, &seen.heard);
+    let x = t.residual_norm(w, "encoder.blocks.0.ln1", x, attended);
+    let more = forward(t, w, "encoder.blocks.0.mlp", x);
+    t.residual_norm(w, "encoder.blocks.0.ln2", x, more)
 }
 
-/// The standard deviation that a `log_std` of this family stands for.
-pub fn sigma(w: &Weights) -> Tensor<2> {
-    sigmoid(w.get("decoder.log_std")) * 0.5
+/// The values, `[rows, 1]`.
+pub fn values(t: &mut Tape, w: Network, seen: &Seen) -> Matrix {
+    let encoded = encode(t, w, seen);
+    through_head(t, w, "encoder.head", encoded)
 }
 
-/// The same of the numbers of a log_std, as its logarithm.
+/// The numbers of a log_std of this family as logarithms of the standard deviations that they stand for.
 pub fn log_of_sigma(log_std: &[f32]) -> Vec<f32> {
     log_std.iter().map(|x| 0.5f32.ln() - (1.0 + (-x).exp()).ln()).collect()
 }
 
-/// What the critic of this family costs.
-pub fn value_cost() -> ValueLoss {
-    ValueLoss { coefficient: 1.0, huber: Some(10.0) }
+/// Means of the actions of some modules, `[rows, ACTIONS]`, given what the encoder made of their observations and the action of the module
+/// before each. `attend` is the attention of that name, asking with one matrix for what is in the other.
+fn decode(
+    t: &mut Tape,
+    w: Network,
+    encoded: Matrix,
+    told: &[f32],
+    mut attend: impl FnMut(&mut Tape, &'static str, [Matrix; 2]) -> Matrix,
+) -> Matrix {
+    let told = t.input(told, ACTIONS);
+    let x = t.activated(w, "decoder.action_encoder.0", Activation::Gelu, told);
+    let x = t.norm(w, "decoder.ln", x);
+    let attended = attend(t, ATTENTIONS[0], [x, x]);
+    let x = t.residual_norm(w, "decoder.blocks.0.ln1", x, attended);
+    let attended = attend(t, ATTENTIONS[1], [encoded, x]);
+    let x = t.residual_norm(w, "decoder.blocks.0.ln2", encoded, attended);
+    let more = forward(t, w, "decoder.blocks.0.mlp", x);
+    let x = t.residual_norm(w, "decoder.blocks.0.ln3", x, more);
+    through_head(t, w, "decoder.head", x)
 }
 
-impl Mat {
-    /// Means of the actions, given what the encoder made of the observations and the actions of all modules.
-    fn decode(self, w: &Weights, seen: &Seen, encoded: Tensor<2>, actions: Tensor<2>) -> Tensor<2> {
-        let (teams, n) = (seen.teams, seen.modules);
-        // Everyone is told the action of the one before; the first is told zeros.
-        let first = actions.clone().reshape([teams, n, ACTIONS]).narrow(1, 0, 1) * 0.0;
-        let told = Tensor::cat(vec![first, actions.reshape([teams, n, ACTIONS]).narrow(1, 0, n - 1)], 1);
-        self.decode_told(w, seen, encoded, told.reshape([teams * n, ACTIONS]))
-    }
+/// The attentions of the decoder.
+const ATTENTIONS: [&str; 2] = ["decoder.blocks.0.attn1", "decoder.blocks.0.attn2"];
 
-    fn decode_told(self, w: &Weights, seen: &Seen, encoded: Tensor<2>, told: Tensor<2>) -> Tensor<2> {
-        let n = seen.modules;
-        let later: Vec<f32> = (0..n * n).map(|i| if i % n > i / n { LATER } else { 0.0 }).collect();
-        let mask = seen.mask.clone() + w.tensor(&later, [1, n, n]);
-        let x = Activation::Gelu.apply(w.linear("decoder.action_encoder.0", told));
-        let x = w.layer_norm("decoder.ln", x);
-        let attended = w.attention("decoder.blocks.0.attn1", x.clone(), x.clone(), mask.clone());
-        let x = w.layer_norm("decoder.blocks.0.ln1", x + attended);
-        let attended = w.attention("decoder.blocks.0.attn2", encoded.clone(), x, mask);
-        let x = w.layer_norm("decoder.blocks.0.ln2", encoded + attended);
-        let forward = w.mlp(&["decoder.blocks.0.mlp.0", "decoder.blocks.0.mlp.2"], Activation::Gelu, x.clone());
-        let x = w.layer_norm("decoder.blocks.0.ln3", x + forward);
-        through_head(w, "decoder.head", x)
-    }
+/// What the module of a row is told, given the actions of all: that of the one before it, the first zeros.
+fn told(actions: &[f32], query: &Query, row: usize) -> [f32; ACTIONS] {
+    if row == query.first { [0.0; ACTIONS] } else { actions.as_chunks::<ACTIONS>().0[row - 1] }
 }
 
-impl TensorNetworks for Mat {
-    fn layouts(&self) -> [Layout; 2] {
+impl TapedNetworks for Mat {
+    fn layout(&self) -> Layout {
         let mut layout = Layout::default();
         encoder_layout(&mut layout);
-        layout.vector("decoder.log_std", ACTIONS, 1.0);
+        layout.vector(LOG_STD, ACTIONS, 1.0);
         layout.linear("decoder.action_encoder.0", ACTIONS, WIDTH, Scheme::Orthogonal(GAINS[0]));
         layout.layer_norm("decoder.ln", WIDTH);
         for norm in ["ln1", "ln2", "ln3"] {
             layout.layer_norm(&format!("decoder.blocks.0.{norm}"), WIDTH);
         }
-        attention(&mut layout, "decoder.blocks.0.attn1");
-        attention(&mut layout, "decoder.blocks.0.attn2");
+        ATTENTIONS.iter().for_each(|name| attention(&mut layout, name));
         feed_forward(&mut layout, "decoder.blocks.0.mlp");
         head(&mut layout, "decoder.head", ACTIONS);
-        [layout, Layout::default()]
+        layout
     }
 
-    fn ratio(&self) -> Ratio {
-        Ratio::Dimension
+    fn evaluate(&self, t: &mut Tape, w: Network, seen: &Seen, actions: &[f32]) -> [Matrix; 2] {
+        let encoded = encode(t, w, seen);
+        let values = through_head(t, w, "encoder.head", encoded);
+        let told: Vec<f32> =
+            seen.before.iter().enumerate().flat_map(|(row, query)| told(actions, query, row)).collect();
+        let attend = |t: &mut Tape, name: &str, [query, x]: [Matrix; 2]| t.attention(w, name, query, x, &seen.before);
+        [decode(t, w, encoded, &told, attend), values]
     }
 
-    fn valued(&self) -> Valued {
-        Valued::Module
+    fn values(&self, t: &mut Tape, w: Network, seen: &Seen) -> Matrix {
+        values(t, w, seen)
     }
 
-    fn value_loss(&self) -> ValueLoss {
-        value_cost()
-    }
-
-    fn entropy_sums(&self) -> [bool; 2] {
-        [false, false]
-    }
-
-    fn evaluate(&self, w: &Weights, seen: &Seen, actions: Tensor<2>) -> Evaluation {
-        let (encoded, values) = encode(w, seen);
-        Evaluation { means: self.decode(w, seen, encoded, actions), sigma: sigma(w), values }
-    }
-
-    fn values(&self, w: &Weights, seen: &Seen) -> Tensor<2> {
-        encode(w, seen).1
-    }
-
-    /// Of the first round: as if all modules before did nothing.
-    fn distribution(&self, w: &Weights, seen: &Seen) -> (Tensor<2>, Tensor<2>) {
-        let nothing = w.tensor(&vec![0.0; seen.teams * seen.modules * ACTIONS], [seen.teams * seen.modules, ACTIONS]);
-        (self.decode(w, seen, encode(w, seen).0, nothing), sigma(w))
-    }
-
-    fn act(&self, w: &Weights, seen: &Seen, noise: Tensor<2>) -> (Tensor<2>, Tensor<2>) {
-        let (teams, n) = (seen.teams, seen.modules);
-        let (encoded, _) = encode(w, seen);
-        let noise = noise.reshape([teams, n, ACTIONS]);
-        let sigma = sigma(w);
-        // One after the other. What comes later is masked, so that anything may stand there meanwhile.
-        let mut actions = noise.clone() * 0.0;
-        let mut means = actions.clone();
-        for module in 0..n {
-            let all = self.decode(w, seen, encoded.clone(), actions.clone().reshape([teams * n, ACTIONS]));
-            let mean = all.reshape([teams, n, ACTIONS]).narrow(1, module, 1);
-            let drawn = mean.clone() + noise.clone().narrow(1, module, 1) * sigma.clone().reshape([1, 1, ACTIONS]);
-            let place = [0..teams, module..module + 1, 0..ACTIONS];
-            actions = actions.slice_assign(place.clone(), drawn);
-            means = means.slice_assign(place, mean);
+    /// One module after the other, those of all teams together.
+    fn act(&self, t: &mut Tape, w: Network, seen: &Seen, noise: &[f32], sigma: [f32; ACTIONS]) -> [Vec<f32>; 2] {
+        let encoded = encode(t, w, seen);
+        let encoded = t.numbers(encoded);
+        let (mut means, mut actions) = (vec![0.0; noise.len()], vec![0.0; noise.len()]);
+        let mut pasts = ATTENTIONS.map(|name| (name, Past::default()));
+        for module in 0..seen.modules.iter().copied().max().unwrap_or(0) {
+            let (rows, queries): (Vec<usize>, Vec<Query>) =
+                seen.before.iter().copied().enumerate().filter(|(row, query)| row - query.first == module).unzip();
+            let told: Vec<f32> =
+                rows.iter().zip(&queries).flat_map(|(row, query)| told(&actions, query, *row)).collect();
+            let own: Vec<f32> = rows.iter().flat_map(|row| &encoded[row * WIDTH..][..WIDTH]).copied().collect();
+            let own = t.input(&own, WIDTH);
+            let found = decode(t, w, own, &told, |t, name, x| {
+                let (_, past) = pasts.iter_mut().find(|(of, _)| *of == name).expect("an attention of the decoder");
+                t.attention_by_rows(w, name, x, (&rows, &queries), past)
+            });
+            for (row, mean) in rows.iter().zip(t.numbers(found).as_chunks::<ACTIONS>().0) {
+                let at = row * ACTIONS..(row + 1) * ACTIONS;
+                means[at.clone()].copy_from_slice(mean);
+                actions[at.clone()].copy_from_slice(&draw(mean, &noise[at], sigma));
+            }
         }
-        let rows = [teams * n, ACTIONS];
-        let (actions, means) = (actions.reshape(rows), means.reshape(rows));
-        (actions.clone(), log_density(actions, means, sigma))
+        [means, actions]
     }
 
-    fn log_sigma(&self, parameters: &[f32]) -> Vec<f32> {
-        log_of_sigma(&parameters[self.layouts()[0].range("decoder.log_std")])
-    }
-
-    fn policy(&self, parameters: &[f32], _mean: &[f32], _std: &[f32]) -> TrainedPolicy {
+    fn policy(&self, parameters: &[f32]) -> TrainedPolicy {
         TrainedPolicy::Weights(SavedWeights::raw(Method::Mat, parameters))
     }
 }

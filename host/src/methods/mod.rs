@@ -10,6 +10,7 @@ pub mod config;
 pub mod curriculum;
 pub mod imagination;
 pub(crate) mod kernels;
+pub mod layers;
 pub mod mappo;
 pub mod mat;
 pub mod mat_dec;

@@ -32,6 +32,8 @@ pub struct Entry {
     pub columns: usize,
     /// Where it starts.
     pub offset: usize,
+    /// Whether it is the matrix of a linear layer, which may have a single row too.
+    pub(super) matrix: bool,
     initial: Initial,
 }
 
@@ -83,14 +85,14 @@ impl Layout {
         self.entries.iter().find(|entry| entry.name == name).expect("a layer of this network").range()
     }
 
-    fn add(&mut self, name: String, rows: usize, columns: usize, initial: Initial) {
-        self.entries.push(Entry { name, rows, columns, offset: self.len, initial });
+    fn add(&mut self, name: String, [rows, columns]: [usize; 2], matrix: bool, initial: Initial) {
+        self.entries.push(Entry { name, rows, columns, offset: self.len, matrix, initial });
         self.len += rows * columns;
     }
 
     /// A vector.
     pub fn vector(&mut self, name: &str, size: usize, value: f32) {
-        self.add(name.into(), 1, size, Initial::Constant(value));
+        self.add(name.into(), [1, size], false, Initial::Constant(value));
     }
 
     /// A linear layer: `NAME.weight` and `NAME.bias`.
@@ -102,14 +104,14 @@ impl Layout {
                 (within, within)
             }
         };
-        self.add(format!("{name}.weight"), outputs, inputs, weight);
-        self.add(format!("{name}.bias"), 1, outputs, bias);
+        self.add(format!("{name}.weight"), [outputs, inputs], true, weight);
+        self.add(format!("{name}.bias"), [1, outputs], false, bias);
     }
 
     /// Layer normalisation: `NAME.weight` and `NAME.bias`.
     pub fn layer_norm(&mut self, name: &str, size: usize) {
-        self.add(format!("{name}.weight"), 1, size, Initial::Constant(1.0));
-        self.add(format!("{name}.bias"), 1, size, Initial::Constant(0.0));
+        self.add(format!("{name}.weight"), [1, size], false, Initial::Constant(1.0));
+        self.add(format!("{name}.bias"), [1, size], false, Initial::Constant(0.0));
     }
 
     /// Another behind this one.

@@ -6,7 +6,7 @@ use super::{Batch, Ratio, Valued};
 use crate::methods::tensors::floats;
 
 /// ln(2 pi) / 2.
-const LOG_ROOT_TAU: f32 = 0.918_938_5;
+pub(super) const LOG_ROOT_TAU: f32 = 0.918_938_5;
 
 /// The loss of the values.
 #[derive(Clone, Copy, Debug, PartialEq)]

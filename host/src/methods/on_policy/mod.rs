@@ -8,6 +8,7 @@ pub mod autodiff;
 pub mod buffer;
 pub mod collect;
 pub mod losses;
+pub mod taped;
 pub mod update;
 
 use std::sync::Arc;
