@@ -148,7 +148,7 @@ mod tests {
         );
         for of in [1, 2, 7, 120, 500] {
             let mut parts: Vec<String> = (1..=of)
-                .flat_map(|index| Shard { index, of }.select(runs.clone()).into_iter().map(|run| run.name))
+                .flat_map(|index| Shard { index, of }.select(runs.clone()).map(|run| run.name))
                 .collect();
             parts.sort();
             let mut all: Vec<String> = runs.iter().map(|run| run.name.clone()).collect();
