@@ -147,9 +147,8 @@ mod tests {
             ("goal-reaching-composer-1", "wall-climbing-smp-1")
         );
         for of in [1, 2, 7, 120, 500] {
-            let mut parts: Vec<String> = (1..=of)
-                .flat_map(|index| Shard { index, of }.select(runs.clone()).map(|run| run.name))
-                .collect();
+            let mut parts: Vec<String> =
+                (1..=of).flat_map(|index| Shard { index, of }.select(runs.clone()).map(|run| run.name)).collect();
             parts.sort();
             let mut all: Vec<String> = runs.iter().map(|run| run.name.clone()).collect();
             all.sort();
