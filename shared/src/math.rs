@@ -64,7 +64,9 @@ mod tests {
 
     #[test]
     fn every_angle_gives_something_finite() {
-        let bits = (0..=u32::MAX).step_by(9973).map(f32::from_bits);
+        // Miri takes a thousand times as long.
+        let step = if cfg!(miri) { 99_999_989 } else { 9973 };
+        let bits = (0..=u32::MAX).step_by(step).map(f32::from_bits);
         for x in bits.chain([f32::NAN, f32::INFINITY, f32::NEG_INFINITY, f32::MAX, 0.0, -0.0]) {
             let (sin, cos) = sin_cos(x);
             assert!(sin.abs() <= 1.0 && cos.abs() <= 1.0, "{x}: {sin} {cos}");
