@@ -161,6 +161,7 @@ mod tests {
     }
 
     #[test]
+    #[cfg_attr(miri, ignore = "takes hours there")]
     fn weak_motors_that_lag_and_a_noisy_current_sense_raise_no_alarm_in_a_million_steps_and_dead_ones_do_in_half_a_second()
      {
         let mut number = numbers();

@@ -138,6 +138,7 @@ mod tests {
     }
 
     #[test]
+    #[cfg_attr(miri, ignore = "takes hours there")]
     fn a_shorted_motor_is_given_up_after_a_few_and_begins_again_only_when_told() {
         let mut trips = Trips::default();
         assert_eq!(shorted(&mut trips, 0, 600), u32::from(MOST));
@@ -152,6 +153,7 @@ mod tests {
     }
 
     #[test]
+    #[cfg_attr(miri, ignore = "takes hours there")]
     fn a_driver_that_never_shows_a_gap_is_given_up_too() {
         let mut trips = Trips::default();
         let mut times = 0;

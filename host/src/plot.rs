@@ -154,7 +154,8 @@ pub fn panels(panels: &[Panel]) -> String {
     }
     let width = WIDTH * panels.len().max(1) as f64;
     // Text widths are estimates (7 px a letter): an SVG cannot ask for the font.
-    let entry_width = |name: &str| 44.0 + 7.2 * name.chars().count() as f64;
+    let entry_width =
+        |name: &str| 44.0 + name.chars().map(|letter| if letter.is_uppercase() { 9.6 } else { 7.2 }).sum::<f64>();
     let mut rows: Vec<Vec<(&str, usize)>> = Vec::new();
     let mut used = f64::INFINITY;
     for entry in legend {

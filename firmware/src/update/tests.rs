@@ -276,6 +276,7 @@ fn whatever_is_not_signed_whole_and_new_is_refused() {
 
 /// No bit of header and image may flip without the module noticing, and saying so.
 #[test]
+#[cfg_attr(miri, ignore = "takes hours there")]
 fn a_flipped_bit_anywhere_is_refused() {
     let key = test_key(1);
     let keys = [*key.verifying_key().as_bytes(), NO_KEY];
@@ -359,6 +360,7 @@ impl Examiner<'_> {
 /// All pairs are gone through. Most leave the same flash behind, because the recovery erases what the first cut left in the slot: what a flash of the same contents comes
 /// to is looked at once.
 #[test]
+#[cfg_attr(miri, ignore = "takes hours there")]
 fn whenever_the_power_goes_the_module_has_the_old_policy_or_the_new_one() {
     let (first, new) = (package(&image(1), 3, None), package(&image(2), 5, None));
     let mut before = G4::new();
@@ -526,6 +528,7 @@ impl Random {
 
 /// Good signatures, and signatures, messages and keys that were spoilt: salty and dalek are of one mind. COMPOSER_EXHAUSTIVE: of 10^5 messages.
 #[test]
+#[cfg_attr(miri, ignore = "takes hours there")]
 fn signatures_are_judged_as_dalek_judges_them() {
     let messages = if std::env::var_os("COMPOSER_EXHAUSTIVE").is_some() { 100_000 } else { 1_000 };
     let mut random = Random(SplitMix64(1));
@@ -570,6 +573,7 @@ fn signatures_are_judged_as_dalek_judges_them() {
 /// Anything at all as header, chunk, piece, record and page of records: nothing panics, what is understood is written back as the same bytes, a module starts with
 /// one of its slots, and no header is authentic that dalek refuses. COMPOSER_FUZZ says how many inputs.
 #[test]
+#[cfg_attr(miri, ignore = "takes hours there")]
 fn any_bytes_are_survived_and_nothing_is_authentic_that_dalek_refuses() {
     use ed25519_dalek::Verifier;
     let inputs: u64 = std::env::var("COMPOSER_FUZZ").map_or(200_000, |text| text.parse().expect("a number"));
