@@ -323,7 +323,7 @@ mod tests {
     fn tanh_agrees_with_libm() {
         let mut worst = 0.0f64;
         let mut previous = -ONE;
-        for argument in -(8 << 16)..=(8 << 16) {
+        for argument in (-(8 << 16)..=(8 << 16)).step_by(if cfg!(miri) { 4099 } else { 1 }) {
             let value = tanh(argument);
             let exact = libm::tanh(f64::from(argument) / 65536.0);
             worst = worst.max((f64::from(value) / f64::from(ONE) - exact).abs());
@@ -339,7 +339,7 @@ mod tests {
     fn exp2_agrees_with_libm() {
         let mut worst = 0.0f64;
         let mut previous = 65536;
-        for x in 0..=(20 << 16) {
+        for x in (0..=(20 << 16)).step_by(if cfg!(miri) { 4099 } else { 1 }) {
             let value = exp2_neg(x);
             assert!(value <= previous, "{x}");
             previous = value;

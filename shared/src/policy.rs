@@ -1259,6 +1259,7 @@ mod tests {
     }
 
     #[test]
+    #[cfg_attr(miri, ignore = "takes hours there")]
     fn every_damage_is_refused() {
         let mut image = random(3);
         for byte in 0..IMAGE_SIZE {
@@ -1415,6 +1416,7 @@ mod tests {
 
     /// The same for memory, bias and the whole observation.
     #[test]
+    #[cfg_attr(miri, ignore = "takes hours there")]
     fn the_bits_of_a_memory_are_pinned() {
         let mut image = Box::new([0; IMAGE_SIZE]);
         random_image_of(Shape::FULL, 7, &mut image);
@@ -1460,6 +1462,7 @@ mod tests {
     }
 
     #[test]
+    #[cfg_attr(miri, ignore = "takes hours there")]
     fn a_memory_leaks_without_stalling_and_starts_empty() {
         for now in [nn::ONE, -nn::ONE, 1, -1, 12_345] {
             let mut memory = Memory::default();
@@ -1500,6 +1503,7 @@ mod tests {
     }
 
     #[test]
+    #[cfg_attr(miri, ignore = "takes hours there")]
     fn random_policies_are_alive() {
         let mut largest = 0.0f32;
         for seed in 0..20 {
