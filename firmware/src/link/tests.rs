@@ -247,6 +247,7 @@ proptest! {
 
     /// Whatever bytes come, a module neither panics nor falls silent: each message gets an answer, and the next one is understood.
     #[test]
+    #[cfg_attr(miri, ignore = "takes hours there")]
     fn any_bytes_are_survived(noise in prop::collection::vec(prop_oneof![Just(0u8), any::<u8>()], 0..1500), damage in any::<(u8, u8)>()) {
         let image = image();
         let policy = Policy::parse(&image).unwrap();
