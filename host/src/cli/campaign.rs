@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
-use std::io::Write as _;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::Mutex;
@@ -105,15 +105,11 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let campaign = Campaign { config: config.clone(), policy, launcher: &launcher, seed: arguments.seed };
     if let (Some(schedule), Some(number)) = (&arguments.schedule, arguments.number) {
         schedule.check(config.robot.modules)?;
-        let broken = match &arguments.capture {
-            None => campaign.run(schedule, number)?,
-            Some(path) => {
-                let mut log = Vec::new();
-                let broken = campaign.run_captured(schedule, number, Some(&mut log))?;
-                write_whole(path, &log)?;
-                broken
-            }
-        };
+        let mut log = arguments.capture.as_ref().map(|_| Vec::new());
+        let broken = campaign.run_captured(schedule, number, log.as_mut().map(|log| log as &mut dyn Write))?;
+        if let (Some(path), Some(log)) = (&arguments.capture, log) {
+            write_whole(path, &log)?;
+        }
         return match broken {
             None => {
                 println!("no rule is broken");

@@ -665,15 +665,9 @@ fn attend_backward_body<V: Vector>(
 mod tests {
     use burn::tensor::Tensor;
 
-    use super::super::random::{Stream, normal_noise, stream};
+    use super::super::random::numbers;
     use super::super::tensors::{Scheme, Weights, floats};
     use super::*;
-
-    fn numbers(count: usize, seed: u64) -> Vec<f32> {
-        let mut numbers = Vec::new();
-        normal_noise(&mut stream(seed, Stream::Noise, 0, 0), count, 1, &mut numbers);
-        numbers
-    }
 
     fn near(what: &str, found: &[f32], expected: &[f32]) {
         assert_eq!(found.len(), expected.len());

@@ -50,6 +50,14 @@ pub fn normal_noise(rng: &mut impl Rng, modules: usize, outputs: usize, to: &mut
     }
 }
 
+/// Standard normal numbers for tests, the same ones from the same seed.
+#[cfg(test)]
+pub(crate) fn numbers(count: usize, seed: u64) -> Vec<f32> {
+    let mut numbers = Vec::new();
+    normal_noise(&mut stream(seed, Stream::Noise, 0, 0), count, 1, &mut numbers);
+    numbers
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

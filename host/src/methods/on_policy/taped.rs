@@ -292,14 +292,8 @@ mod tests {
     use crate::methods::mat::Mat;
     use crate::methods::mat_dec::MatDec;
     use crate::methods::on_policy::losses;
-    use crate::methods::random::{Stream, normal_noise, stream};
+    use crate::methods::random::{Stream, numbers, stream};
     use crate::methods::tensors::{Weights, scalar};
-
-    fn numbers(count: usize, seed: u64) -> Vec<f32> {
-        let mut numbers = Vec::new();
-        normal_noise(&mut stream(seed, Stream::Noise, 0, 0), count, 1, &mut numbers);
-        numbers
-    }
 
     /// Teams of several lengths, where not everyone hears everyone and not everyone acts.
     fn batch(modules: &[usize]) -> Batch {
