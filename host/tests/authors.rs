@@ -8,8 +8,8 @@ use composer_host::methods::mat::Mat;
 use composer_host::methods::mat_dec::MatDec;
 use composer_host::methods::normalise::{Forgetting, ValueNorm};
 use composer_host::methods::off_policy::{DeterministicActorCritic, Td3, Td3Settings, Transitions};
-use composer_host::methods::on_policy::autodiff::{Autodiff, Evaluation, TensorNetworks, seen};
-use composer_host::methods::on_policy::losses::{entropy, log_density, value_loss};
+use composer_host::methods::on_policy::autodiff::seen;
+use composer_host::methods::on_policy::losses::value_loss;
 use composer_host::methods::on_policy::taped::{Taped, TapedNetworks};
 use composer_host::methods::on_policy::{
     ActorCritic, Batch, Decisions, Gradient, LossSettings, Part, Teams, Trajectory, Valued,
@@ -26,13 +26,9 @@ const GRADIENT: f32 = 1e-4;
 const STEP: f32 = 5e-3;
 
 /// Networks with the parameters of a fixture.
-fn networks<N: TensorNetworks>(fixture: &Fixture, networks: N) -> Autodiff<N> {
+fn networks<N: TapedNetworks>(fixture: &Fixture, networks: N) -> Taped<N> {
     let [actor, critic] = networks.layouts();
-    let mut autodiff = Autodiff::new(networks);
-    for (part, layout) in [(Part::Actor, actor), (Part::Critic, critic)] {
-        autodiff.load(part, &parameters(fixture, &layout));
-    }
-    autodiff
+    Taped::new(networks, parameters(fixture, &actor.followed_by(&critic)))
 }
 
 fn parameters(fixture: &Fixture, layout: &Layout) -> Vec<f32> {
@@ -44,20 +40,21 @@ fn heard(teams: usize, modules: usize) -> Vec<u64> {
     vec![(1 << modules) - 1; teams * modules]
 }
 
-/// Densities of given actions, `[rows, outputs]`, and the values.
-fn scored<N: TensorNetworks>(
-    networks: &Autodiff<N>,
+/// Means, values and densities of given actions, `[rows, 2]`.
+fn scored<N: TapedNetworks>(
+    networks: &Taped<N>,
     observations: &[f32],
     actions: &[f32],
     modules: usize,
-) -> (Evaluation, Vec<f32>) {
+) -> [Vec<f32>; 3] {
     let teams = observations.len() / 40 / modules;
-    let weights = networks.weights();
-    let seen = seen(weights, observations, &heard(teams, modules), modules);
-    let actions = weights.tensor(actions, [teams * modules, 2]);
-    let evaluation = networks.networks.evaluate(weights, &seen, actions.clone());
-    let densities = log_density(actions, evaluation.means.clone(), evaluation.sigma.clone());
-    (evaluation, floats(densities))
+    let (heard, modules) = (heard(teams, modules), vec![modules; teams]);
+    networks.evaluate(Teams { observations, privileged: &[], heard: &heard, modules: &modules }, actions)
+}
+
+/// The entropies of the actions.
+fn entropies<N: TapedNetworks>(networks: &Taped<N>) -> Vec<f32> {
+    networks.log_sigma().iter().map(|l| l + 1.418_938_5).collect()
 }
 
 /// What a policy draws with this noise, and the densities of that.
@@ -105,13 +102,17 @@ fn value_norm(fixture: &Fixture) -> ValueNorm {
 }
 
 /// Gradients of both parts over a batch.
-fn gradients<N: TensorNetworks>(networks: &Autodiff<N>, batch: &Batch, loss: LossSettings) -> [Gradient; 2] {
-    let [actor, critic] = networks.networks.layouts();
+fn gradients<N: TapedNetworks>(
+    networks: &Taped<N>,
+    [actor, critic]: [&Layout; 2],
+    batch: &Batch,
+    loss: LossSettings,
+) -> [Gradient; 2] {
     let mut sums = [Gradient::default(), Gradient::default()];
     sums[0].clear(actor.len());
     sums[1].clear(critic.len());
     let [of_actor, of_critic] = &mut sums;
-    networks.gradient(batch, loss, &mut (), Some(of_actor), Some(of_critic));
+    networks.gradient(batch, loss, &mut Default::default(), Some(of_actor), Some(of_critic));
     sums
 }
 
@@ -162,20 +163,15 @@ fn compare_step(
 
 /// What MAT and MAT_dec have in common.
 fn mat_family<N: TapedNetworks>(fixture: &Fixture, method: N) {
-    let networks = Taped::new(method.clone(), parameters(fixture, &method.layout()));
-    // Means, values and densities of given actions.
-    let scored = |observations: &[f32], actions: &[f32], modules: usize| {
-        let teams = observations.len() / 40 / modules;
-        let (heard, modules) = (heard(teams, modules), vec![modules; teams]);
-        networks.evaluate(Teams { observations, privileged: &[], heard: &heard, modules: &modules }, actions)
-    };
+    let networks = networks(fixture, method.clone());
+    let scored = |observations: &[f32], actions: &[f32], modules| scored(&networks, observations, actions, modules);
     let (observations, actions) = (fixture.get("in.obs"), fixture.get("in.actions"));
     let [means, values, densities] = scored(&observations, &actions, 8);
     same("action_mean", &means, &fixture.get("out.action_mean"), OUTPUT);
     same("action_std", &networks.sigma(), &fixture.get("out.action_std"), OUTPUT);
     same("values", &values, &fixture.get("out.values"), OUTPUT);
     same("log_probs", &densities, &fixture.get("out.log_probs"), OUTPUT);
-    let entropy: Vec<f32> = networks.log_sigma().iter().map(|l| l + 1.418_938_5).collect();
+    let entropy = entropies(&networks);
     same("entropy", &entropy, &fixture.get("out.entropy")[..2], OUTPUT);
     // The means, one after the other, and with noise; scored in one pass they have the densities that they were drawn with.
     let [deterministic, of_deterministic] = drawn(&networks, &observations, &[0.0; 48], 8);
@@ -194,12 +190,6 @@ fn mat_family<N: TapedNetworks>(fixture: &Fixture, method: N) {
         same("ar_det.actions", &deterministic, &of("ar_det.actions"), OUTPUT);
     }
 
-    let gradients = |networks: &Taped<N>, batch: &Batch, loss: LossSettings| {
-        let mut sum = Gradient::default();
-        sum.clear(networks.layout().len());
-        networks.gradient(batch, loss, &mut Default::default(), Some(&mut sum), None);
-        sum
-    };
     let mut norm = value_norm(fixture);
     let mut batch = batch(fixture, "in.obs", "in.actions", 8);
     batch.log_probabilities = fixture.get("upd.in.old_log_probs");
@@ -207,7 +197,8 @@ fn mat_family<N: TapedNetworks>(fixture: &Fixture, method: N) {
     batch.values = fixture.get("upd.in.value_preds");
     batch.targets = fixture.get("upd.in.returns").iter().map(|r| norm.normalise(*r)).collect();
     let loss = LossSettings { clip: 0.05, entropy: 0.001, team_weight: 1.0 / 3.0 };
-    let sum = gradients(&networks, &batch, loss);
+    let layouts = method.layouts();
+    let [sum, _] = gradients(&networks, layouts.each_ref(), &batch, loss);
     let layout = networks.layout();
     let step = |step: usize, name: &str| f64::from(fixture.get(&format!("upd.step{step}.{name}"))[0]);
     let close = |name: &str, found: f64, expected: f64, tolerance: f64| {
@@ -227,7 +218,7 @@ fn mat_family<N: TapedNetworks>(fixture: &Fixture, method: N) {
     after.load(Part::Actor, &weights);
     norm.update(&fixture.get("upd.in.returns"));
     batch.targets = fixture.get("upd.in.returns").iter().map(|r| norm.normalise(*r)).collect();
-    let sum = gradients(&after, &batch, loss);
+    let [sum, _] = gradients(&after, layouts.each_ref(), &batch, loss);
     close("step 2 policy_loss", sum.policy_loss, step(2, "policy_loss"), 1e-3);
     close("step 2 value_loss", sum.value_loss, step(2, "value_loss"), 1e-3);
 }
@@ -245,14 +236,15 @@ fn mat_dec_is_its_authors() {
 #[test]
 fn mappo_is_its_authors() {
     let fixture = Fixture::load("mappo");
-    let networks = networks(&fixture, Mappo::on_policy(8));
-    let (evaluation, densities) = scored(&networks, &fixture.get("in.obs"), &fixture.get("in.actions"), 8);
-    same("action_mean", &floats(evaluation.means), &fixture.get("out.action_mean"), OUTPUT);
-    same("action_std", &floats(evaluation.sigma.clone()), &fixture.get("out.action_std"), OUTPUT);
-    same("values", &floats(evaluation.values), &fixture.get("out.values"), OUTPUT);
+    let method = Mappo::on_policy(8);
+    let networks = networks(&fixture, method.clone());
+    let [means, values, densities] = scored(&networks, &fixture.get("in.obs"), &fixture.get("in.actions"), 8);
+    same("action_mean", &means, &fixture.get("out.action_mean"), OUTPUT);
+    same("action_std", &networks.sigma(), &fixture.get("out.action_std"), OUTPUT);
+    same("values", &values, &fixture.get("out.values"), OUTPUT);
     let joint: Vec<f32> = densities.chunks(2).map(|pair| pair[0] + pair[1]).collect();
     same("log_probs", &joint, &fixture.get("out.log_probs"), OUTPUT);
-    let entropy: f32 = floats(entropy(evaluation.sigma)).iter().sum();
+    let entropy: f32 = entropies(&networks).iter().sum();
     same("entropy", &[entropy], &fixture.get("out.entropy_mean"), OUTPUT);
     let [_, of_mode] = drawn(&networks, &fixture.get("in.obs"), &[0.0; 48], 8);
     same("mode_log_probs", &of_mode, &fixture.get("out.mode_log_probs"), OUTPUT);
@@ -264,10 +256,10 @@ fn mappo_is_its_authors() {
     batch.values = fixture.get("upd.in.value_preds");
     batch.targets = fixture.get("upd.in.returns").iter().map(|r| norm.normalise(*r)).collect();
     let loss = LossSettings { clip: 0.2, entropy: 0.01, team_weight: 1.0 / 3.0 };
-    let [of_actor, of_critic] = gradients(&networks, &batch, loss);
+    let [actor, critic] = method.layouts();
+    let [of_actor, of_critic] = gradients(&networks, [&actor, &critic], &batch, loss);
     same("policy_loss", &[of_actor.policy_loss as f32], &fixture.get("upd.clean.policy_loss"), 2e-5);
     same("value_loss", &[of_critic.value_loss as f32], &fixture.get("upd.clean.value_loss"), 2e-5);
-    let [actor, critic] = networks.networks.layouts();
     assert_eq!(compare_gradient(&fixture, "upd.clean.grad", &actor, &of_actor.gradient), actor.len());
     assert_eq!(compare_gradient(&fixture, "upd.grad", &critic, &of_critic.gradient), critic.len());
     let (norm, _) = compare_step(&fixture, &actor, &of_actor.gradient, 10.0, 5e-4, "upd.after1");
@@ -279,11 +271,12 @@ fn mappo_is_its_authors() {
 #[test]
 fn mappo_for_torques_is_harls() {
     let fixture = Fixture::load("mappo_harl");
-    let mut networks = networks(&fixture, Mappo::harl(8));
-    let (evaluation, densities) = scored(&networks, &fixture.get("in.obs"), &fixture.get("in.actions"), 8);
-    same("action_mean", &floats(evaluation.means), &fixture.get("out.action_mean"), OUTPUT);
-    same("action_std", &floats(evaluation.sigma), &fixture.get("out.action_std"), OUTPUT);
-    same("values", &floats(evaluation.values), &fixture.get("out.values"), OUTPUT);
+    let method = Mappo::harl(8);
+    let valuing_teams = networks(&fixture, method.clone());
+    let [means, values, densities] = scored(&valuing_teams, &fixture.get("in.obs"), &fixture.get("in.actions"), 8);
+    same("action_mean", &means, &fixture.get("out.action_mean"), OUTPUT);
+    same("action_std", &valuing_teams.sigma(), &fixture.get("out.action_std"), OUTPUT);
+    same("values", &values, &fixture.get("out.values"), OUTPUT);
     same("log_probs", &densities, &fixture.get("out.log_probs"), OUTPUT);
 
     let norm = value_norm(&fixture);
@@ -294,19 +287,21 @@ fn mappo_for_torques_is_harls() {
     of_teams.targets = fixture.get("upd.in.returns").iter().map(|r| norm.normalise(*r)).collect();
     of_teams.advantages = vec![0.0; 3];
     let loss = LossSettings { clip: 0.1, entropy: 0.0, team_weight: 1.0 / 3.0 };
-    let [_, of_critic] = gradients(&networks, &of_teams, loss);
+    let [actor, critic] = method.layouts();
+    let [_, of_critic] = gradients(&valuing_teams, [&actor, &critic], &of_teams, loss);
     // Its fixture has an advantage for every module, a team's value or not.
-    networks.networks.valued = Valued::Module;
+    let mut of_modules = method;
+    of_modules.valued = Valued::Module;
+    let valuing_modules = networks(&fixture, of_modules);
     let of_modules = Batch {
         advantages: fixture.get("upd.in.advantages"),
         values: vec![0.0; 24],
         targets: vec![0.0; 24],
         ..of_teams.clone()
     };
-    let [of_actor, _] = gradients(&networks, &of_modules, loss);
+    let [of_actor, _] = gradients(&valuing_modules, [&actor, &critic], &of_modules, loss);
     same("policy_loss", &[of_actor.policy_loss as f32], &fixture.get("upd.policy_loss"), 2e-5);
     same("value_loss", &[of_critic.value_loss as f32], &fixture.get("upd.value_loss"), 2e-5);
-    let [actor, critic] = networks.networks.layouts();
     compare_gradient(&fixture, "upd.grad", &actor, &of_actor.gradient);
     let mut compared = 0;
     for entry in critic.entries() {
@@ -325,23 +320,24 @@ fn mappo_for_torques_is_harls() {
 #[test]
 fn ppo_is_cleanrls_with_padding() {
     let fixture = Fixture::load("ppo_padded");
-    let networks = networks(&fixture, Ppo { modules: 11 });
+    let method = Ppo { modules: 11 };
+    let networks = networks(&fixture, method);
     // The original is naive about padding: to it the robot has eleven modules, three of which see zeros.
     let alive = fixture.get("in.obs_of_live_modules");
     let observations: Vec<f32> = alive.chunks(8 * 40).flat_map(|team| [team, &[0.0; 3 * 40]].concat()).collect();
     let actions = fixture.get("in.actions");
-    let (evaluation, densities) = scored(&networks, &observations, &actions, 11);
-    same("action_mean", &floats(evaluation.means), &fixture.get("out.action_mean"), OUTPUT);
-    same("action_std", &floats(evaluation.sigma.clone())[..22], &fixture.get("out.action_std"), OUTPUT);
-    same("values", &floats(evaluation.values), &fixture.get("out.values"), OUTPUT);
+    let [means, values, densities] = scored(&networks, &observations, &actions, 11);
+    same("action_mean", &means, &fixture.get("out.action_mean"), OUTPUT);
+    same("action_std", &networks.sigma(), &fixture.get("out.action_std"), OUTPUT);
+    same("values", &values, &fixture.get("out.values"), OUTPUT);
     let joint: Vec<f32> = densities.chunks(22).map(|team| team.iter().sum()).collect();
     same("log_probs", &joint, &fixture.get("out.log_probs"), OUTPUT);
-    let entropy: f32 = floats(entropy(evaluation.sigma))[..22].iter().sum();
+    let entropy: f32 = entropies(&networks).iter().sum();
     same("entropy", &[entropy], &fixture.get("out.entropy")[..1], OUTPUT);
     // Eight modules and padding put out the same as the first eight of those eleven.
-    let shorter = scored(&networks, &alive, &vec![0.0; 24 * 16], 8).0;
+    let [shorter, _, _] = scored(&networks, &alive, &vec![0.0; 24 * 16], 8);
     let expected: Vec<f32> = fixture.get("out.action_mean").chunks(22).flat_map(|team| team[..16].to_vec()).collect();
-    same("eight modules", &floats(shorter.means), &expected, OUTPUT);
+    same("eight modules", &shorter, &expected, OUTPUT);
 
     let advantages = fixture.get("upd.in.advantages");
     let mean = advantages.iter().sum::<f32>() / 24.0;
@@ -361,7 +357,7 @@ fn ppo_is_cleanrls_with_padding() {
         ..Batch::default()
     };
     let loss = LossSettings { clip: 0.2, entropy: 0.01, team_weight: 1.0 / 24.0 };
-    let [sum, _] = gradients(&networks, &batch, loss);
+    let [sum, _] = gradients(&networks, method.layouts().each_ref(), &batch, loss);
     same("pg_loss", &[sum.policy_loss as f32], &fixture.get("upd.pg_loss"), 1e-4);
     same("v_loss", &[sum.value_loss as f32], &fixture.get("upd.v_loss"), 2e-5);
     same("approx_kl", &[sum.kl as f32], &fixture.get("upd.approx_kl"), 1e-4);

@@ -9,7 +9,6 @@ use super::mappo::Mappo;
 use super::mat::Mat;
 use super::mat_dec::MatDec;
 use super::normalise::{Forgetting, ValueNorm};
-use super::on_policy::autodiff::{Autodiff, TensorNetworks, seen};
 use super::on_policy::collect::ACTIONS;
 use super::on_policy::taped::{Scratch, Taped, TapedNetworks};
 use super::on_policy::update::Standardise;
@@ -17,7 +16,7 @@ use super::on_policy::{ActorCritic, Learner, OnPolicy, OnPolicySettings, Teams};
 use super::ppo::{self, Ppo};
 use super::random::{Stream, stream};
 use super::smp::SmpPolicy;
-use super::tensors::{Weights, floats};
+use super::tensors::Layout;
 use super::{Algorithm, MakeEnvironment, Method, checked};
 use crate::environment::{View, with_itself};
 use crate::policy::{Memories, Policy};
@@ -177,18 +176,12 @@ fn check(section: &str, settings: &OnPolicySettings) -> Result<()> {
 }
 
 /// A learner of `networks` that has learnt nothing.
-pub fn learner<N: TensorNetworks>(networks: N, seed: u64, forgetting: Forgetting, rate: f64) -> Learner<Autodiff<N>> {
+pub fn learner<N: TapedNetworks>(networks: N, seed: u64, forgetting: Forgetting, rate: f64) -> Learner<Taped<N>> {
+    let initial = |layout: &Layout, part| layout.initial(&mut stream(seed, Stream::Weights, 2, part));
     let [actor, critic] = networks.layouts();
-    let initial = |layout: &super::tensors::Layout, part| layout.initial(&mut stream(seed, Stream::Weights, 2, part));
     let (actor, critic) = (initial(&actor, 0), initial(&critic, 1));
-    Learner::new(Autodiff::new(networks), seed, actor, critic, ValueNorm::new(forgetting), 1e-5, rate as f32)
-}
-
-/// The same of networks on a tape, which have one optimiser.
-pub fn taped_learner<N: TapedNetworks>(networks: N, seed: u64, rate: f64) -> Learner<Taped<N>> {
-    let initial = networks.layout().initial(&mut stream(seed, Stream::Weights, 2, 0));
-    let (networks, value_norm) = (Taped::new(networks, initial.clone()), ValueNorm::new(Forgetting::Minibatches));
-    Learner::new(networks, seed, initial, Vec::new(), value_norm, 1e-5, rate as f32)
+    let networks = Taped::new(networks, [&actor[..], &critic].concat());
+    Learner::new(networks, seed, actor, critic, ValueNorm::new(forgetting), 1e-5, rate as f32)
 }
 
 /// The modules that all environments have, for a method whose critic is made for a number of them.
@@ -235,13 +228,13 @@ pub fn mappo(config: &TrainConfig, make: MakeEnvironment) -> Result<Box<dyn Algo
 
 /// A run of MAT.
 pub fn mat(config: &TrainConfig, make: MakeEnvironment) -> Result<Box<dyn Algorithm>> {
-    let learner = taped_learner(Mat, config.seed, config.mat.learning_rate);
+    let learner = learner(Mat, config.seed, Forgetting::Minibatches, config.mat.learning_rate);
     Ok(Box::new(OnPolicy::new(config, config.mat.on_policy(), learner, None, make)?))
 }
 
 /// A run of MAT_dec.
 pub fn mat_dec(config: &TrainConfig, make: MakeEnvironment) -> Result<Box<dyn Algorithm>> {
-    let learner = taped_learner(MatDec, config.seed, config.mat_dec.learning_rate);
+    let learner = learner(MatDec, config.seed, Forgetting::Minibatches, config.mat_dec.learning_rate);
     Ok(Box::new(OnPolicy::new(config, config.mat_dec.on_policy(), learner, None, make)?))
 }
 
@@ -295,8 +288,8 @@ impl SavedWeights {
         let expected = match self.method {
             Method::Ppo => parameters_of(&Ppo { modules: self.modules }),
             Method::Mappo => parameters_of(&Mappo::harl(self.modules)),
-            Method::Mat => Mat.layout().len(),
-            Method::MatDec => MatDec.layout().len(),
+            Method::Mat => parameters_of(&Mat),
+            Method::MatDec => parameters_of(&MatDec),
             Method::Smp if SmpPolicy::new(self).is_some() => self.parameters.len(),
             method => bail!("its parameters are none of {method}"),
         };
@@ -314,8 +307,8 @@ impl SavedWeights {
         match self.method {
             Method::Ppo => self.with(Ppo { modules: self.modules }),
             Method::Mappo => self.with(Mappo::harl(self.modules)),
-            Method::Mat => Box::new(TapedPolicy::new(self, Mat)),
-            Method::MatDec => Box::new(TapedPolicy::new(self, MatDec)),
+            Method::Mat => self.with(Mat),
+            Method::MatDec => self.with(MatDec),
             Method::Smp => match SmpPolicy::new(self) {
                 Some(policy) => Box::new(policy),
                 None => Box::new(crate::policy::Still),
@@ -325,55 +318,16 @@ impl SavedWeights {
         }
     }
 
-    fn with<N: TensorNetworks>(&self, networks: N) -> Box<dyn Policy + '_> {
-        Box::new(TensorPolicy::new(self, networks))
+    fn with<N: TapedNetworks>(&self, networks: N) -> Box<dyn Policy + '_> {
+        Box::new(TapedPolicy::new(self, networks))
     }
 }
 
-fn parameters_of(networks: &impl TensorNetworks) -> usize {
-    networks.layouts().iter().map(super::tensors::Layout::len).sum()
+fn parameters_of(networks: &impl TapedNetworks) -> usize {
+    networks.layouts().iter().map(Layout::len).sum()
 }
 
 /// Networks that act without noise.
-pub struct TensorPolicy<'a, N> {
-    saved: &'a SavedWeights,
-    networks: N,
-    weights: Weights,
-}
-
-impl<'a, N: TensorNetworks> TensorPolicy<'a, N> {
-    /// With the weights that were saved of them.
-    pub fn new(saved: &'a SavedWeights, networks: N) -> Self {
-        let [actor, critic] = networks.layouts();
-        let weights = Weights::new(&actor.followed_by(&critic), &saved.parameters);
-        Self { saved, networks, weights }
-    }
-}
-
-impl<N: TensorNetworks> Policy for TensorPolicy<'_, N> {
-    fn act(
-        &self,
-        view: &View,
-        _noise: u64,
-        _memories: &mut Memories,
-        actions: &mut Vec<[f32; 2]>,
-        _attention: Option<&mut Vec<f32>>,
-    ) {
-        let all = view.observations.len();
-        // Modules beyond those that the networks are made for hang limp.
-        let n = self.networks.most_modules().map_or(all, |most| all.min(most));
-        let heard: Vec<u64> = with_itself(&view.heard[..n]).collect();
-        let observations = self.saved.normalised(view);
-        let seen = seen(&self.weights, &observations[..n * BASE], &heard, n);
-        let noise = self.weights.tensor(&vec![0.0; n * ACTIONS], [n, ACTIONS]);
-        let means = floats(self.networks.act(&self.weights, &seen, noise).0);
-        actions.clear();
-        actions.extend_from_slice(means.as_chunks::<ACTIONS>().0);
-        actions.resize(all, [0.0; ACTIONS]);
-    }
-}
-
-/// The same on a tape.
 pub struct TapedPolicy<'a, N> {
     saved: &'a SavedWeights,
     networks: Taped<N>,
@@ -395,20 +349,22 @@ impl<N: TapedNetworks> Policy for TapedPolicy<'_, N> {
         actions: &mut Vec<[f32; 2]>,
         _attention: Option<&mut Vec<f32>>,
     ) {
-        let modules = view.observations.len();
+        let all = view.observations.len();
+        // Modules beyond those that the networks are made for hang limp.
+        let n = self.networks.most_modules().map_or(all, |most| all.min(most));
         let (observations, heard) = (self.saved.normalised(view), with_itself(&view.heard).collect::<Vec<u64>>());
-        let teams = Teams { observations: &observations, privileged: &[], heard: &heard, modules: &[modules] };
+        let teams =
+            Teams { observations: &observations[..n * BASE], privileged: &[], heard: &heard[..n], modules: &[n] };
         let (mut means, mut densities) = (Vec::new(), Vec::new());
-        let noise = vec![0.0; modules * ACTIONS];
-        self.networks.sample(teams, &noise, &mut Scratch::default(), &mut means, &mut densities);
+        self.networks.sample(teams, &vec![0.0; n * ACTIONS], &mut Scratch::default(), &mut means, &mut densities);
         actions.clear();
         actions.extend_from_slice(means.as_chunks::<ACTIONS>().0);
+        actions.resize(all, [0.0; ACTIONS]);
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::tensors::Layout;
     use super::*;
 
     /// Gains of the initial matrices by the end of their names; the biases are zeros.
@@ -434,9 +390,9 @@ mod tests {
     fn initial_weights_have_the_authors_gains() {
         let root2 = std::f32::consts::SQRT_2;
         let small = ["query", "key", "value", "proj", "mlp.2", "decoder.head.3"].map(|name| (name, 0.01));
-        let Learner { networks, .. } = taped_learner(Mat, 3, 1e-3);
+        let Learner { networks, .. } = learner(Mat, 3, Forgetting::Off, 1e-3);
         gains(networks.layout(), networks.parameters(), &small, root2);
-        let Learner { networks, .. } = taped_learner(MatDec, 3, 1e-3);
+        let Learner { networks, .. } = learner(MatDec, 3, Forgetting::Off, 1e-3);
         let more = [&small[..], &[("decoder.mlp.7", 0.01)]].concat();
         gains(networks.layout(), networks.parameters(), &more, root2);
         for networks in [Mappo::harl(8), Mappo::on_policy(8)] {

@@ -1,4 +1,4 @@
-//! Layers with their ways back, over flat f32 numbers: what the networks of [`mat`](super::mat) and [`mat_dec`](super::mat_dec) are made of.
+//! Layers with their ways back, over flat f32 numbers: what the networks of the baselines are made of.
 //!
 //! A [`Tape`] computes at once and notes what it did; [`Tape::backward`] goes through the notes from the last to the first. Every layer is
 //! here once forth and once back, side by side, with the gradient written by hand (`of_x`: the gradient of x). The tests compare them with
@@ -185,6 +185,8 @@ enum Step {
     Norm { network: Network, weight: Place, bias: Place, x: Matrix, plus: Option<Matrix>, y: Matrix },
     /// `y_i = sum_j a_ij v_j`, `a_i = softmax(q_i k_j / sqrt(width))`; a is kept behind y.
     Attention { q: Matrix, k: Matrix, v: Matrix, queries: Arc<[Query]>, y: Matrix },
+    /// Row i of y is the part of a row of x that belongs to module i of its team.
+    Rows { x: Matrix, teams: Arc<[Query]>, y: Matrix },
 }
 
 /// Working memory of a [`Tape`], which grows to what it needs and stays.
@@ -364,6 +366,18 @@ impl<'a> Tape<'a> {
         self.linear(w, &format!("{name}.proj"), y)
     }
 
+    /// What is one row a team with `columns` numbers for each module, as one row a module; more modules than a team has are left out. `teams` says
+    /// of each row of the result which its team's are.
+    pub fn rows(&mut self, x: Matrix, columns: usize, teams: &Arc<[Query]>) -> Matrix {
+        let y = self.matrix(teams.len(), columns, x.tracked);
+        let (earlier, of_y, _) = self.split(y);
+        for (y, from) in of_y.chunks_exact_mut(padded(columns)).zip(parts_of_teams(x, columns, teams)) {
+            y[..columns].copy_from_slice(&earlier[from..from + columns]);
+            y[columns..].fill(0.0);
+        }
+        self.note(y, Step::Rows { x, teams: teams.clone(), y })
+    }
+
     /// Goes back from the gradients of some matrices, `[rows, columns]` each, and adds those of the parameters of the network that learns to
     /// `sum`, packed.
     pub fn backward(self, of: &[(Matrix, &[f32])], sum: &mut [f32]) {
@@ -375,7 +389,8 @@ impl<'a> Tape<'a> {
             rows.for_each(|(to, of_y)| add(&mut to[..y.columns], of_y));
         }
         for step in steps.iter().rev() {
-            let (Step::Linear { y, .. } | Step::Norm { y, .. } | Step::Attention { y, .. }) = step;
+            let (Step::Linear { y, .. } | Step::Norm { y, .. } | Step::Attention { y, .. } | Step::Rows { y, .. }) =
+                step;
             // What a step is made of lies before its result, and what it kept behind.
             let (earlier, of_y) = gradients.split_at_mut(y.start);
             let of_y = &mut of_y[..y.len()];
@@ -426,9 +441,24 @@ impl<'a> Tape<'a> {
                     let [q_rows, k_rows, v_rows] = [q, k, v].map(|x| &numbers[x.range()]);
                     attend_backward([q_rows, k_rows, v_rows], q.columns, queries, behind, of_y, of);
                 }
+                Step::Rows { x, teams, y } => {
+                    for (of_y, to) in of_y.chunks_exact(y.stride()).zip(parts_of_teams(*x, y.columns, teams)) {
+                        add(&mut earlier[to..to + y.columns], &of_y[..y.columns]);
+                    }
+                }
             }
         }
     }
+}
+
+/// Where among all numbers the part of each row's module begins in its team's row of x.
+fn parts_of_teams(x: Matrix, columns: usize, teams: &[Query]) -> impl Iterator<Item = usize> {
+    let mut team = 0;
+    teams.iter().enumerate().map(move |(row, Query { first, n, .. })| {
+        let part = x.start + team * x.stride() + (row - first) * columns;
+        team += usize::from(row + 1 == first + n);
+        part
+    })
 }
 
 /// `to += from`

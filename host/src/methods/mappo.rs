@@ -14,16 +14,14 @@
 //! step teach nothing). Mended for MAPPO: on-policy's buffer repeats the joint density for every action, which makes the policy's loss as
 //! many times too large.
 
-use burn::tensor::Tensor;
-use burn::tensor::activation::sigmoid;
 use composer_shared::observation::BASE;
 
-use super::on_policy::autodiff::{Evaluation, Seen, TensorNetworks};
+use super::layers::{Matrix, Network, Tape};
 use super::on_policy::collect::ACTIONS;
-use super::on_policy::losses::ValueLoss;
+use super::on_policy::taped::{Deviation, Seen, TapedNetworks};
 use super::on_policy::{Ratio, Valued};
-use super::tensors::{Activation, Layout, Scheme, Weights};
-use super::{Method, SavedWeights, TrainedPolicy, mat};
+use super::tensors::{Activation, Layout, Scheme};
+use super::{Method, SavedWeights, TrainedPolicy};
 
 /// Actor and critic.
 #[derive(Clone, Debug)]
@@ -33,8 +31,8 @@ pub struct Mappo {
     /// Linear layer and layer normalisation of each hidden layer, by the names that they have in the original.
     layers: Vec<[&'static str; 2]>,
     width: usize,
-    /// sigma = 0.5 sigmoid(log_std), else exp(log_std).
-    squashed: bool,
+    /// Name of log_std in the original, and what it stands for.
+    log_std: (&'static str, Deviation),
     /// One value a team, or the same repeated for every module.
     pub valued: Valued,
 }
@@ -47,18 +45,15 @@ impl Mappo {
             ["base.mlp.fc.3", "base.mlp.fc.5"],
             ["base.mlp.fc.6", "base.mlp.fc.8"],
         ];
-        Self { modules, layers, width: 128, squashed: true, valued: Valued::Team }
+        let log_std = ("actor.act.action_out.log_std", Deviation::Squashed);
+        Self { modules, layers, width: 128, log_std, valued: Valued::Team }
     }
 
     /// The authors' own.
     pub fn on_policy(modules: usize) -> Self {
         let layers = vec![["base.mlp.fc1.0", "base.mlp.fc1.2"], ["base.mlp.fc2.0.0", "base.mlp.fc2.0.2"]];
-        Self { modules, layers, width: 64, squashed: false, valued: Valued::Module }
-    }
-
-    /// Name of log_std in the original.
-    fn log_std(&self) -> &'static str {
-        if self.squashed { "actor.act.action_out.log_std" } else { "actor.act.action_out.logstd._bias" }
+        let log_std = ("actor.act.action_out.logstd._bias", Deviation::Exponential);
+        Self { modules, layers, width: 64, log_std, valued: Valued::Module }
     }
 
     fn base(&self, layout: &mut Layout, of: &str, inputs: usize) {
@@ -72,23 +67,29 @@ impl Mappo {
         }
     }
 
-    fn through_base(&self, w: &Weights, of: &str, x: Tensor<2>) -> Tensor<2> {
-        let x = w.layer_norm(&format!("{of}.base.feature_norm"), x);
+    fn through_base(&self, t: &mut Tape, w: Network, of: &str, x: Matrix) -> Matrix {
+        let x = t.norm(w, &format!("{of}.base.feature_norm"), x);
         self.layers.iter().fold(x, |x, [linear, norm]| {
-            w.layer_norm(&format!("{of}.{norm}"), Activation::Relu.apply(w.linear(&format!("{of}.{linear}"), x)))
+            let x = t.activated(w, &format!("{of}.{linear}"), Activation::Relu, x);
+            t.norm(w, &format!("{of}.{norm}"), x)
         })
     }
 }
 
-impl TensorNetworks for Mappo {
+impl TapedNetworks for Mappo {
     fn layouts(&self) -> [Layout; 2] {
         let (mut actor, mut critic) = (Layout::default(), Layout::default());
         self.base(&mut actor, "actor", BASE);
         actor.linear("actor.act.action_out.fc_mean", self.width, ACTIONS, Scheme::Orthogonal(0.01));
-        actor.vector(self.log_std(), ACTIONS, if self.squashed { 1.0 } else { 0.0 });
+        let (log_std, deviation) = self.log_std;
+        actor.vector(log_std, ACTIONS, if deviation == Deviation::Squashed { 1.0 } else { 0.0 });
         self.base(&mut critic, "critic", self.modules * BASE);
         critic.linear("critic.v_out", self.width, 1, Scheme::Orthogonal(1.0));
         [actor, critic]
+    }
+
+    fn log_std(&self) -> (&'static str, Deviation) {
+        self.log_std
     }
 
     fn ratio(&self) -> Ratio {
@@ -99,38 +100,22 @@ impl TensorNetworks for Mappo {
         self.valued
     }
 
-    fn value_loss(&self) -> ValueLoss {
-        ValueLoss { coefficient: 1.0, huber: Some(10.0) }
-    }
-
     fn entropy_sums(&self) -> [bool; 2] {
         [true, false]
     }
 
-    fn evaluate(&self, w: &Weights, seen: &Seen, _actions: Tensor<2>) -> Evaluation {
-        let (means, sigma) = self.distribution(w, seen);
-        Evaluation { means, sigma, values: self.values(w, seen) }
+    fn means(&self, t: &mut Tape, w: Network, seen: &Seen, _actions: &[f32]) -> Matrix {
+        let x = self.through_base(t, w, "actor", seen.observations);
+        t.linear(w, "actor.act.action_out.fc_mean", x)
     }
 
-    fn values(&self, w: &Weights, seen: &Seen) -> Tensor<2> {
-        let joint = seen.observations.clone().reshape([seen.teams, seen.modules * BASE]);
-        let values = w.linear("critic.v_out", self.through_base(w, "critic", joint));
-        match self.valued {
-            Valued::Team => values,
-            Valued::Module => values.repeat(&[1, seen.modules]).reshape([seen.teams * seen.modules, 1]),
-        }
-    }
-
-    fn distribution(&self, w: &Weights, seen: &Seen) -> (Tensor<2>, Tensor<2>) {
-        let x = self.through_base(w, "actor", seen.observations.clone());
-        let log_std = w.get(self.log_std());
-        let sigma = if self.squashed { sigmoid(log_std) * 0.5 } else { log_std.exp() };
-        (w.linear("actor.act.action_out.fc_mean", x), sigma)
-    }
-
-    fn log_sigma(&self, actor: &[f32]) -> Vec<f32> {
-        let log_std = &actor[self.layouts()[0].range(self.log_std())];
-        if self.squashed { mat::log_of_sigma(log_std) } else { log_std.to_vec() }
+    fn values(&self, t: &mut Tape, w: Network, seen: &Seen) -> Matrix {
+        let rows = if self.valued == Valued::Team { 1 } else { self.modules };
+        let joint: Vec<f32> =
+            seen.teams().flat_map(|(_, team)| std::iter::repeat_n(team, rows)).flatten().copied().collect();
+        let joint = t.input(&joint, self.modules * BASE);
+        let x = self.through_base(t, w, "critic", joint);
+        t.linear(w, "critic.v_out", x)
     }
 
     fn policy(&self, parameters: &[f32], _mean: &[f32], _std: &[f32]) -> TrainedPolicy {

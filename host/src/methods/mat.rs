@@ -98,11 +98,6 @@ pub fn values(t: &mut Tape, w: Network, seen: &Seen) -> Matrix {
     through_head(t, w, "encoder.head", encoded)
 }
 
-/// The numbers of a log_std of this family as logarithms of the standard deviations that they stand for.
-pub fn log_of_sigma(log_std: &[f32]) -> Vec<f32> {
-    log_std.iter().map(|x| 0.5f32.ln() - (1.0 + (-x).exp()).ln()).collect()
-}
-
 /// Means of the actions of some modules, `[rows, ACTIONS]`, given what the encoder made of their observations and the action of the module
 /// before each. `attend` is the attention of that name, asking with one matrix for what is in the other.
 fn decode(
@@ -124,6 +119,13 @@ fn decode(
     through_head(t, w, "decoder.head", x)
 }
 
+/// The same of all modules at once, where the actions of all are known.
+fn decode_at_once(t: &mut Tape, w: Network, seen: &Seen, encoded: Matrix, actions: &[f32]) -> Matrix {
+    let told: Vec<f32> = seen.before.iter().enumerate().flat_map(|(row, query)| told(actions, query, row)).collect();
+    let attend = |t: &mut Tape, name: &str, [query, x]: [Matrix; 2]| t.attention(w, name, query, x, &seen.before);
+    decode(t, w, encoded, &told, attend)
+}
+
 /// The attentions of the decoder.
 const ATTENTIONS: [&str; 2] = ["decoder.blocks.0.attn1", "decoder.blocks.0.attn2"];
 
@@ -133,7 +135,7 @@ fn told(actions: &[f32], query: &Query, row: usize) -> [f32; ACTIONS] {
 }
 
 impl TapedNetworks for Mat {
-    fn layout(&self) -> Layout {
+    fn layouts(&self) -> [Layout; 2] {
         let mut layout = Layout::default();
         encoder_layout(&mut layout);
         layout.vector(LOG_STD, ACTIONS, 1.0);
@@ -145,16 +147,19 @@ impl TapedNetworks for Mat {
         ATTENTIONS.iter().for_each(|name| attention(&mut layout, name));
         feed_forward(&mut layout, "decoder.blocks.0.mlp");
         head(&mut layout, "decoder.head", ACTIONS);
-        layout
+        [layout, Layout::default()]
     }
 
+    fn means(&self, t: &mut Tape, w: Network, seen: &Seen, actions: &[f32]) -> Matrix {
+        let encoded = encode(t, w, seen);
+        decode_at_once(t, w, seen, encoded, actions)
+    }
+
+    /// Means and values out of one encoding.
     fn evaluate(&self, t: &mut Tape, w: Network, seen: &Seen, actions: &[f32]) -> [Matrix; 2] {
         let encoded = encode(t, w, seen);
         let values = through_head(t, w, "encoder.head", encoded);
-        let told: Vec<f32> =
-            seen.before.iter().enumerate().flat_map(|(row, query)| told(actions, query, row)).collect();
-        let attend = |t: &mut Tape, name: &str, [query, x]: [Matrix; 2]| t.attention(w, name, query, x, &seen.before);
-        [decode(t, w, encoded, &told, attend), values]
+        [decode_at_once(t, w, seen, encoded, actions), values]
     }
 
     fn values(&self, t: &mut Tape, w: Network, seen: &Seen) -> Matrix {
@@ -162,7 +167,7 @@ impl TapedNetworks for Mat {
     }
 
     /// One module after the other, those of all teams together.
-    fn act(&self, t: &mut Tape, w: Network, seen: &Seen, noise: &[f32], sigma: [f32; ACTIONS]) -> [Vec<f32>; 2] {
+    fn act(&self, t: &mut Tape, w: Network, seen: &Seen, noise: &[f32], sigma: &[f32]) -> [Vec<f32>; 2] {
         let encoded = encode(t, w, seen);
         let encoded = t.numbers(encoded);
         let (mut means, mut actions) = (vec![0.0; noise.len()], vec![0.0; noise.len()]);
@@ -187,7 +192,7 @@ impl TapedNetworks for Mat {
         [means, actions]
     }
 
-    fn policy(&self, parameters: &[f32]) -> TrainedPolicy {
+    fn policy(&self, parameters: &[f32], _mean: &[f32], _std: &[f32]) -> TrainedPolicy {
         TrainedPolicy::Weights(SavedWeights::raw(Method::Mat, parameters))
     }
 }

@@ -10,7 +10,7 @@ use composer_shared::observation::BASE;
 use super::layers::{Matrix, Network, Tape};
 use super::mat::{GAINS, WIDTH, encoder_layout, values};
 use super::on_policy::collect::ACTIONS;
-use super::on_policy::taped::{LOG_STD, Seen, TapedNetworks, draw};
+use super::on_policy::taped::{LOG_STD, Seen, TapedNetworks};
 use super::tensors::{Activation, Layout, Scheme};
 use super::{Method, SavedWeights, TrainedPolicy};
 
@@ -18,18 +18,8 @@ use super::{Method, SavedWeights, TrainedPolicy};
 #[derive(Clone, Copy, Debug, Default)]
 pub struct MatDec;
 
-/// Means of the actions, `[rows, ACTIONS]`.
-fn means(t: &mut Tape, w: Network, seen: &Seen) -> Matrix {
-    let x = t.norm(w, "decoder.mlp.0", seen.observations);
-    let x = t.activated(w, "decoder.mlp.1", Activation::Gelu, x);
-    let x = t.norm(w, "decoder.mlp.3", x);
-    let x = t.activated(w, "decoder.mlp.4", Activation::Gelu, x);
-    let x = t.norm(w, "decoder.mlp.6", x);
-    t.linear(w, "decoder.mlp.7", x)
-}
-
 impl TapedNetworks for MatDec {
-    fn layout(&self) -> Layout {
+    fn layouts(&self) -> [Layout; 2] {
         let mut layout = Layout::default();
         encoder_layout(&mut layout);
         layout.vector(LOG_STD, ACTIONS, 1.0);
@@ -39,25 +29,23 @@ impl TapedNetworks for MatDec {
         layout.linear("decoder.mlp.4", WIDTH, WIDTH, Scheme::Orthogonal(GAINS[0]));
         layout.layer_norm("decoder.mlp.6", WIDTH);
         layout.linear("decoder.mlp.7", WIDTH, ACTIONS, Scheme::Orthogonal(GAINS[1]));
-        layout
+        [layout, Layout::default()]
     }
 
-    fn evaluate(&self, t: &mut Tape, w: Network, seen: &Seen, _actions: &[f32]) -> [Matrix; 2] {
-        [means(t, w, seen), values(t, w, seen)]
+    fn means(&self, t: &mut Tape, w: Network, seen: &Seen, _actions: &[f32]) -> Matrix {
+        let x = t.norm(w, "decoder.mlp.0", seen.observations);
+        let x = t.activated(w, "decoder.mlp.1", Activation::Gelu, x);
+        let x = t.norm(w, "decoder.mlp.3", x);
+        let x = t.activated(w, "decoder.mlp.4", Activation::Gelu, x);
+        let x = t.norm(w, "decoder.mlp.6", x);
+        t.linear(w, "decoder.mlp.7", x)
     }
 
     fn values(&self, t: &mut Tape, w: Network, seen: &Seen) -> Matrix {
         values(t, w, seen)
     }
 
-    fn act(&self, t: &mut Tape, w: Network, seen: &Seen, noise: &[f32], sigma: [f32; ACTIONS]) -> [Vec<f32>; 2] {
-        let means = means(t, w, seen);
-        let means = t.numbers(means);
-        let actions = draw(&means, noise, sigma);
-        [means, actions]
-    }
-
-    fn policy(&self, parameters: &[f32]) -> TrainedPolicy {
+    fn policy(&self, parameters: &[f32], _mean: &[f32], _std: &[f32]) -> TrainedPolicy {
         TrainedPolicy::Weights(SavedWeights::raw(Method::MatDec, parameters))
     }
 }

@@ -16,14 +16,14 @@
 //! the reset; statistics are one set for all environments, still during an iteration, and frozen for evaluation. The running
 //! discounted sum of rewards starts anew with every episode.
 
-use burn::tensor::Tensor;
 use composer_shared::observation::BASE;
 
-use super::on_policy::autodiff::{Evaluation, Seen, TensorNetworks};
+use super::layers::{Matrix, Network, Tape};
 use super::on_policy::collect::ACTIONS;
 use super::on_policy::losses::ValueLoss;
+use super::on_policy::taped::{Deviation, Seen, TapedNetworks};
 use super::on_policy::{Ratio, Valued};
-use super::tensors::{Activation, Layout, Scheme, Weights};
+use super::tensors::{Activation, Layout, Scheme};
 use super::{Method, SavedWeights, TrainedPolicy};
 
 /// Modules of the longest snake of the paper's tables.
@@ -39,22 +39,25 @@ pub struct Ppo {
 }
 
 impl Ppo {
-    /// All observations of each team side by side, padded with zeros.
-    fn padded(self, w: &Weights, seen: &Seen) -> Tensor<2> {
-        let Seen { teams, modules, .. } = *seen;
-        // A module that the head does not hear is as absent as padding.
-        let present = seen.mask.clone().narrow(1, 0, 1).reshape([teams * modules, 1]).clamp(-1.0, 0.0) + 1.0;
-        let joint = (seen.observations.clone() * present).reshape([teams, modules * BASE]);
-        let missing = (self.modules - modules) * BASE;
-        if missing == 0 {
-            joint
-        } else {
-            Tensor::cat(vec![joint, w.tensor(&vec![0.0; teams * missing], [teams, missing])], 1)
+    /// The output of a network of three layers that sees all observations of each team side by side, padded with zeros.
+    fn through(self, t: &mut Tape, w: Network, of: &str, seen: &Seen) -> Matrix {
+        let mut joint = Vec::with_capacity(seen.modules.len() * self.modules * BASE);
+        for (team, (heard, observations)) in seen.teams().enumerate() {
+            for (module, observation) in observations.as_chunks::<BASE>().0.iter().enumerate() {
+                // A module that the head does not hear is as absent as padding.
+                let present = heard >> module & 1 == 1;
+                joint.extend(if present { *observation } else { [0.0; BASE] });
+            }
+            joint.resize((team + 1) * self.modules * BASE, 0.0);
         }
+        let x = t.input(&joint, self.modules * BASE);
+        let x = t.activated(w, &format!("{of}.0"), Activation::Tanh, x);
+        let x = t.activated(w, &format!("{of}.2"), Activation::Tanh, x);
+        t.linear(w, &format!("{of}.4"), x)
     }
 }
 
-impl TensorNetworks for Ppo {
+impl TapedNetworks for Ppo {
     fn layouts(&self) -> [Layout; 2] {
         let mut layout = Layout::default();
         let gain = Scheme::Orthogonal(std::f32::consts::SQRT_2);
@@ -65,6 +68,10 @@ impl TensorNetworks for Ppo {
         }
         layout.vector("actor_logstd", self.modules * ACTIONS, 0.0);
         [layout, Layout::default()]
+    }
+
+    fn log_std(&self) -> (&'static str, Deviation) {
+        ("actor_logstd", Deviation::Exponential)
     }
 
     fn most_modules(&self) -> Option<usize> {
@@ -87,25 +94,13 @@ impl TensorNetworks for Ppo {
         [true, true]
     }
 
-    fn evaluate(&self, w: &Weights, seen: &Seen, _actions: Tensor<2>) -> Evaluation {
-        let (means, sigma) = self.distribution(w, seen);
-        Evaluation { means, sigma, values: self.values(w, seen) }
+    fn means(&self, t: &mut Tape, w: Network, seen: &Seen, _actions: &[f32]) -> Matrix {
+        let all = self.through(t, w, "actor_mean", seen);
+        t.rows(all, ACTIONS, &seen.heard)
     }
 
-    fn values(&self, w: &Weights, seen: &Seen) -> Tensor<2> {
-        w.mlp(&["critic.0", "critic.2", "critic.4"], Activation::Tanh, self.padded(w, seen))
-    }
-
-    fn distribution(&self, w: &Weights, seen: &Seen) -> (Tensor<2>, Tensor<2>) {
-        let Seen { teams, modules, .. } = *seen;
-        let (all, rows) = (modules * ACTIONS, [teams * modules, ACTIONS]);
-        let means = w.mlp(&["actor_mean.0", "actor_mean.2", "actor_mean.4"], Activation::Tanh, self.padded(w, seen));
-        let sigma = w.get("actor_logstd").exp().narrow(1, 0, all).repeat(&[teams, 1]);
-        (means.narrow(1, 0, all).reshape(rows), sigma.reshape(rows))
-    }
-
-    fn log_sigma(&self, parameters: &[f32]) -> Vec<f32> {
-        parameters[self.layouts()[0].range("actor_logstd")].to_vec()
+    fn values(&self, t: &mut Tape, w: Network, seen: &Seen) -> Matrix {
+        self.through(t, w, "critic", seen)
     }
 
     fn policy(&self, parameters: &[f32], mean: &[f32], std: &[f32]) -> TrainedPolicy {

@@ -4,10 +4,15 @@
 use burn::tensor::Tensor;
 use composer_shared::observation::BASE;
 
+use super::collect::ACTIONS;
 use super::losses::{ValueLoss, entropy, log_density, policy_loss, value_loss};
-use super::{ActorCritic, Batch, Gradient, LossSettings, Part, Ratio, Teams, Valued};
-use crate::methods::TrainedPolicy;
+use super::{ActorCritic, Batch, Gradient, Learner, LossSettings, Part, Ratio, Teams, Valued};
+use crate::environment::{View, with_itself};
+use crate::methods::normalise::{Forgetting, ValueNorm};
+use crate::methods::random::{Stream, stream};
 use crate::methods::tensors::{Layout, Weights, floats, scalar};
+use crate::methods::{SavedWeights, TrainedPolicy};
+use crate::policy::{Memories, Policy};
 
 /// What some teams of equal length see, as tensors.
 #[derive(Clone, Debug)]
@@ -51,7 +56,7 @@ pub trait TensorNetworks: Clone + Send + Sync + 'static {
 
     /// Actions of a module.
     fn outputs(&self) -> usize {
-        super::collect::ACTIONS
+        ACTIONS
     }
 
     /// The most modules that it can decide for, if there is a limit.
@@ -256,23 +261,57 @@ impl<N: TensorNetworks> ActorCritic for Autodiff<N> {
             let gradient = weights.gradients(&self.layout, &total);
             sum.gradient.iter_mut().zip(&gradient).for_each(|(a, b)| *a += b);
         }
-        // The parts have no parameter in common, so one way back serves both.
-        let (of_actor, of_critic) = sum.gradient.split_at(self.of_actor);
-        let add = |to: &mut [f32], from: &[f32]| to.iter_mut().zip(from).for_each(|(to, from)| *to += from);
-        if let Some(to) = actor {
-            add(&mut to.gradient, of_actor);
-            to.policy_loss += sum.policy_loss;
-            to.value_loss += sum.value_loss;
-            to.kl += sum.kl;
-            to.clipped += sum.clipped;
-        }
-        if let Some(to) = critic {
-            add(&mut to.gradient, of_critic);
-            to.value_loss += sum.value_loss;
-        }
+        sum.hand_over(self.of_actor, actor, critic);
     }
 
     fn policy(&self, mean: &[f32], std: &[f32]) -> TrainedPolicy {
         self.networks.policy(&self.parameters, mean, std)
+    }
+}
+
+/// A learner of `networks` that has learnt nothing.
+pub fn learner<N: TensorNetworks>(networks: N, seed: u64, forgetting: Forgetting, rate: f64) -> Learner<Autodiff<N>> {
+    let [actor, critic] = networks.layouts();
+    let initial = |layout: &Layout, part| layout.initial(&mut stream(seed, Stream::Weights, 2, part));
+    let (actor, critic) = (initial(&actor, 0), initial(&critic, 1));
+    Learner::new(Autodiff::new(networks), seed, actor, critic, ValueNorm::new(forgetting), 1e-5, rate as f32)
+}
+
+/// Networks that act without noise.
+pub struct TensorPolicy<'a, N> {
+    saved: &'a SavedWeights,
+    networks: N,
+    weights: Weights,
+}
+
+impl<'a, N: TensorNetworks> TensorPolicy<'a, N> {
+    /// With the weights that were saved of them.
+    pub fn new(saved: &'a SavedWeights, networks: N) -> Self {
+        let [actor, critic] = networks.layouts();
+        let weights = Weights::new(&actor.followed_by(&critic), &saved.parameters);
+        Self { saved, networks, weights }
+    }
+}
+
+impl<N: TensorNetworks> Policy for TensorPolicy<'_, N> {
+    fn act(
+        &self,
+        view: &View,
+        _noise: u64,
+        _memories: &mut Memories,
+        actions: &mut Vec<[f32; 2]>,
+        _attention: Option<&mut Vec<f32>>,
+    ) {
+        let all = view.observations.len();
+        // Modules beyond those that the networks are made for hang limp.
+        let n = self.networks.most_modules().map_or(all, |most| all.min(most));
+        let heard: Vec<u64> = with_itself(&view.heard[..n]).collect();
+        let observations = self.saved.normalised(view);
+        let seen = seen(&self.weights, &observations[..n * BASE], &heard, n);
+        let noise = self.weights.tensor(&vec![0.0; n * ACTIONS], [n, ACTIONS]);
+        let means = floats(self.networks.act(&self.weights, &seen, noise).0);
+        actions.clear();
+        actions.extend_from_slice(means.as_chunks::<ACTIONS>().0);
+        actions.resize(all, [0.0; ACTIONS]);
     }
 }

@@ -100,6 +100,19 @@ impl Gradient {
         self.kl += other.kl;
         self.clipped += other.clipped;
     }
+
+    /// Adds one over all parameters, the actor's `of_actor` first, to those of the parts that are asked for. The parts have no parameter in
+    /// common, so one way back serves both.
+    fn hand_over(mut self, of_actor: usize, actor: Option<&mut Gradient>, critic: Option<&mut Gradient>) {
+        let of_critic =
+            Gradient { gradient: self.gradient.split_off(of_actor), value_loss: self.value_loss, ..Self::default() };
+        if let Some(to) = actor {
+            to.add(&self);
+        }
+        if let Some(to) = critic {
+            to.add(&of_critic);
+        }
+    }
 }
 
 /// What the losses need besides the batch.
