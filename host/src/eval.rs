@@ -86,7 +86,7 @@ pub struct Trial<'a> {
 
 impl Trial<'_> {
     /// Runs every episode and hands it to `job` in between: (index, environment, seed, faults).
-    fn run<T: Send>(&self, job: impl Fn(&mut SnakeEnv, u64, &[ScheduledFault]) -> T + Sync) -> Vec<T> {
+    pub(crate) fn run<T: Send>(&self, job: impl Fn(&mut SnakeEnv, u64, &[ScheduledFault]) -> T + Sync) -> Vec<T> {
         parallel(self.episodes, self.threads, |index| {
             let seed = episode_seed(self.seed, index as u64);
             let faults = (self.faults)(seed, self.config.robot.modules);

@@ -69,6 +69,21 @@ pub struct Parity {
     pub samples: usize,
 }
 
+impl Parity {
+    /// Of these differences.
+    pub fn of(mut differences: Vec<f32>) -> Self {
+        differences.sort_by(f32::total_cmp);
+        let samples = differences.len();
+        let squares: f64 = differences.iter().map(|d| f64::from(*d).powi(2)).sum();
+        Parity {
+            rms: (squares / samples.max(1) as f64).sqrt() as f32,
+            max: differences.last().copied().unwrap_or(0.0),
+            p99: differences.get((samples * 99).div_ceil(100).saturating_sub(1)).copied().unwrap_or(0.0),
+            samples,
+        }
+    }
+}
+
 /// Shares of the latents seen in calibration that the int8 range has to cover, tried in turn.
 const COVERED: [f64; 2] = [1.0, 0.999];
 /// How much further than that the range reaches: a latent that saturates costs more than a slightly coarser step.
@@ -146,15 +161,7 @@ fn compare(float: &FloatPolicy, policy: &Policy, sequences: &[Sequence]) -> Pari
             differences.extend(exact.as_flattened().iter().zip(integer.as_flattened()).map(|(f, i)| (f - i).abs()));
         }
     }
-    differences.sort_by(f32::total_cmp);
-    let samples = differences.len();
-    let squares: f64 = differences.iter().map(|d| f64::from(*d).powi(2)).sum();
-    Parity {
-        rms: (squares / samples.max(1) as f64).sqrt() as f32,
-        max: differences.last().copied().unwrap_or(0.0),
-        p99: differences.get((samples * 99).div_ceil(100).saturating_sub(1)).copied().unwrap_or(0.0),
-        samples,
-    }
+    Parity::of(differences)
 }
 
 /// The actions of the integer `policy` for all modules of one robot, all of which hear each other; `memories` has one a module, which goes on by a

@@ -5,6 +5,7 @@ pub mod bus_trial;
 pub mod campaign;
 pub mod classic;
 pub mod cli;
+pub mod distil;
 pub mod env;
 pub mod environment;
 pub mod eval;

@@ -9,6 +9,7 @@ use composer_shared::CRC_32;
 use composer_shared::policy::Policy;
 use serde_json::Value;
 
+use crate::distil::{self, distil};
 use crate::env::{FaultTraining, SnakeEnv};
 use crate::eval::{Trial, curve_seed, healthy};
 use crate::files::{create_folder, write_whole};
@@ -18,9 +19,10 @@ use crate::outcome::Report;
 use crate::run::RunConfig;
 use crate::train::{Beside, TrainSummary, checkpoint, follow, metrics as log, train};
 
-/// Seeds of the episodes that scales are taken from, and of those that parity is measured on.
+/// Seeds of the episodes that scales are taken from, of those that parity is measured on, and of those that a network learns another in.
 const CALIBRATION_SEED: u64 = 0xca11;
 const HELD_OUT_SEED: u64 = 0x4e1d;
+const DISTILLED_SEED: u64 = 0xd157;
 
 /// Episodes that scales are taken from, and as many others that parity is measured on.
 pub const CALIBRATION_EPISODES: u64 = 24;
@@ -177,10 +179,11 @@ pub fn alone(folder: &Path) -> Result<File> {
     Ok(file)
 }
 
-/// Freezes the network of a run folder, with scales of `episodes` episodes; the difference of float and integer actions is that of as many others.
+/// Freezes the policy of a run folder, with scales of `episodes` episodes; the difference of float and integer actions is that of as many others.
+/// A network that is not of the image's form, of modules that act alone, is learnt by one that is ([`distil`]) in four times as many.
 pub fn freeze_run(folder: &Path, episodes: u64, threads: usize) -> Result<(RunConfig, Vec<u8>, Parity)> {
     let (config, policy) = load_run(folder)?;
-    let network = policy.network().with_context(|| format!("{} cannot be frozen", folder.display()))?;
+    policy.runs_on_modules().with_context(|| format!("{} cannot be frozen", folder.display()))?;
     let decides = policy.policy();
     let env = Arc::new(config.evaluation());
     let draw = |seed, modules| config.faults.draw(seed, modules);
@@ -191,10 +194,21 @@ pub fn freeze_run(folder: &Path, episodes: u64, threads: usize) -> Result<(RunCo
         faults: if config.faults.probability > 0.0 { &draw } else { &healthy },
         threads,
     };
+    let learnt;
+    let network = match policy.network() {
+        Ok(network) => network,
+        Err(_) => {
+            learnt = distil(&*decides, &Trial { seed: DISTILLED_SEED, ..trial }, distil::UPDATES);
+            &learnt
+        }
+    };
     let image = freeze(network, &config.meta(), &trial.observations(&*decides))?;
     let frozen = Policy::parse(&image).map_err(|e| anyhow::anyhow!("the frozen image is refused: {e}"))?;
-    let held_out = Trial { seed: HELD_OUT_SEED, ..trial }.observations(&*decides);
-    let parity = parity(network, &frozen, &held_out);
+    let held_out = Trial { seed: HELD_OUT_SEED, ..trial };
+    let parity = match &policy {
+        TrainedPolicy::Composer(network) => parity(network, &frozen, &held_out.observations(&*decides)),
+        TrainedPolicy::Weights(_) => distil::parity(&*decides, &frozen, &held_out),
+    };
     Ok((config, image, parity))
 }
 

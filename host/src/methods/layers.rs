@@ -802,6 +802,23 @@ mod tests {
     }
 
     #[test]
+    fn rows_of_modules_are_parts_of_rows_of_teams() {
+        // Teams of three and one, in rows with room for four.
+        let (columns, outputs) = (3, 12);
+        let layout = |layout: &mut Layout| layout.linear("a", 5, outputs, Scheme::Uniform);
+        let query = |first, n| Query { first, n, heard: 0 };
+        let teams: Arc<[Query]> = [query(0, 3), query(0, 3), query(0, 3), query(3, 1)].into();
+        let taped = |t: &mut Tape, w, x| {
+            let all = t.linear(w, "a", x);
+            t.rows(all, columns, &teams)
+        };
+        compare("rows", layout, [2, 5], taped, |w, x| {
+            let all = w.linear("a", x).reshape([8, columns]);
+            Tensor::cat(vec![all.clone().narrow(0, 0, 3), all.narrow(0, 4, 1)], 0)
+        });
+    }
+
+    #[test]
     fn gradients_pass_through_a_network_that_does_not_learn() {
         let mut layout = Layout::default();
         layout.linear("a", 6, 3, Scheme::Uniform);

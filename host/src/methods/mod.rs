@@ -105,17 +105,24 @@ impl Method {
         Self::ALL.into_iter().find(|method| method.name() == name)
     }
 
-    /// Why a policy of this method cannot be frozen for the modules, in a sentence.
+    /// Whether its modules act alone, on their own observations, by a network that is not of the image's form: such a one can learn what theirs
+    /// does ([`crate::distil`]).
+    fn acts_alone(self) -> bool {
+        matches!(self, Method::Mappo | Method::MatDec)
+    }
+
+    /// Why a policy of this method has no network of the image's form, in a sentence.
     fn why_not_frozen(self) -> &'static str {
         match self {
+            Method::Mappo | Method::MatDec => {
+                "mappo and mat_dec normalise every layer, which the image's network does not"
+            }
             Method::Ppo => {
                 "ppo decides for all modules in one place, so there is nothing that a module could run alone"
             }
             Method::Mat => {
                 "mat lets the modules decide one after the other, which no control step of the bus has time for"
             }
-            Method::Mappo => "mappo normalises every layer, which the integer image of a module cannot",
-            Method::MatDec => "mat_dec normalises every layer, which the integer image of a module cannot",
             Method::Smp => {
                 "smp passes messages from tail to head and back, which no control step of the bus has time for"
             }
@@ -229,6 +236,18 @@ impl TrainedPolicy {
         match self {
             TrainedPolicy::Composer(network) => Ok(network),
             TrainedPolicy::Weights(saved) => bail!("{}", saved.method.why_not_frozen()),
+        }
+    }
+
+    /// Whether modules can run it, each for itself: its network, or one that has learnt what it does.
+    ///
+    /// # Errors
+    ///
+    /// If they cannot: why.
+    pub fn runs_on_modules(&self) -> Result<()> {
+        match self {
+            TrainedPolicy::Weights(saved) if saved.method.acts_alone() => Ok(()),
+            _ => self.network().map(drop),
         }
     }
 

@@ -169,7 +169,7 @@ pub fn gather(comparison: &Comparison, outs: &[PathBuf], episodes: u64, so_far: 
         let env = config.evaluation();
         let rows = kept(&folder)?;
         let measured = Measured { rows: &rows, digest: &policy_digest(&folder)?, env: &env, episodes };
-        let not_on_the_bus = policy.network().err().map(|why| why.to_string());
+        let not_on_the_bus = policy.runs_on_modules().err().map(|why| why.to_string());
         let attends = attends(run);
         let mut outcome = Outcome {
             task: TaskName(run.task()),

@@ -429,6 +429,15 @@ impl Results {
             100.0 * LOST
         )];
         let tasks = &self.comparison.tasks;
+        let learnt: Vec<_> =
+            [Method::Mappo, Method::MatDec].into_iter().filter(|m| self.methods().contains(m)).map(title).collect();
+        if !learnt.is_empty() {
+            text.push(format!(
+                "The image of a module has no room for layers that are normalised: what goes onto the bus of {} is a network of COMPOSER's form without attention \
+                 that has learnt what theirs does (host/src/distil.rs), so the difference has that in it, too.",
+                learnt.join(" and ")
+            ));
+        }
         for method in self.methods() {
             let runs: Vec<_> = self.runs.iter().filter(|run| run.method == method.name() && !run.tuned).collect();
             if let Some(why) = runs.iter().find_map(|run| run.not_on_the_bus.clone()) {

@@ -100,8 +100,8 @@ fn finish(run: &Run, out: &Path, episodes: u64, threads: usize) -> Result<bool> 
     let (config, policy) = load_run(&folder)?;
     let env = config.evaluation();
     let measured = Measured { rows: &kept(&folder)?, digest: &policy_digest(&folder)?, env: &env, episodes };
-    let image = || match policy.network() {
-        Ok(_) => Ok(Ok(freeze_run(&folder, CALIBRATION_EPISODES, threads)?.1)),
+    let image = || match policy.runs_on_modules() {
+        Ok(()) => Ok(Ok(freeze_run(&folder, CALIBRATION_EPISODES, threads)?.1)),
         Err(why) => Ok(Err(why.to_string())),
     };
     let points = run.points();
