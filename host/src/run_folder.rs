@@ -180,7 +180,7 @@ pub fn alone(folder: &Path) -> Result<File> {
 }
 
 /// Freezes the policy of a run folder, with scales of `episodes` episodes; the difference of float and integer actions is that of as many others.
-/// A network that is not of the image's form, of modules that act alone, is learnt by one that is ([`distil`]) in four times as many.
+/// A network that is not of the image's form, of modules that act alone, is learnt by one that is ([`distil()`]) in four times as many.
 pub fn freeze_run(folder: &Path, episodes: u64, threads: usize) -> Result<(RunConfig, Vec<u8>, Parity)> {
     let (config, policy) = load_run(folder)?;
     policy.runs_on_modules().with_context(|| format!("{} cannot be frozen", folder.display()))?;

@@ -275,12 +275,11 @@ impl<N: TapedNetworks> Taped<N> {
             match over {
                 Ratio::Dimension => {
                     for at in rows.clone().filter(acts) {
-                        for j in 0..ACTIONS {
+                        of_densities[at - rows.start] = std::array::from_fn(|j| {
                             let log_ratio = density(at, j) - batch.log_probabilities[at * ACTIONS + j];
                             let weight = [batch.weights[at], 1.0 / ACTIONS as f32];
-                            of_densities[at - rows.start][j] =
-                                clipped(log_ratio, advantage(at), weight, loss.clip, sum);
-                        }
+                            clipped(log_ratio, advantage(at), weight, loss.clip, sum)
+                        });
                     }
                 }
                 Ratio::Module => {
