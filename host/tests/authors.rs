@@ -3,12 +3,13 @@
 
 mod fixture;
 
+use composer_host::methods::layers::{Memory, Packed};
 use composer_host::methods::mappo::Mappo;
 use composer_host::methods::mat::Mat;
 use composer_host::methods::mat_dec::MatDec;
 use composer_host::methods::normalise::{Forgetting, ValueNorm};
+use composer_host::methods::off_policy::td3::{self, Sight};
 use composer_host::methods::off_policy::{DeterministicActorCritic, Td3, Td3Settings, Transitions};
-use composer_host::methods::on_policy::autodiff::seen;
 use composer_host::methods::on_policy::losses::value_loss;
 use composer_host::methods::on_policy::taped::{Taped, TapedNetworks};
 use composer_host::methods::on_policy::{
@@ -447,14 +448,14 @@ fn hubers_loss_acts_on_both_sides() {
 /// What SMP's networks put out on a chain.
 fn smp_outputs(fixture: &Fixture, td3: &Td3<Smp>, prefix: &str, values: [&str; 2], modules: usize) {
     let of = |name: &str| fixture.get(&format!("{prefix}{name}"));
-    let (actor, critic) = (td3.actor(), td3.critic());
-    let state = of("in.state");
-    let teams = state.len() / 40 / modules;
-    let seen = seen(&actor, &state, &heard(teams, modules), modules);
-    same("actor_action", &floats(td3.networks.act(&actor, &seen)), &of("out.actor_action"), OUTPUT);
-    let actions = critic.tensor(&of("in.action"), [teams * modules, 2]);
-    for (found, name) in td3.networks.values(&critic, &seen, actions).into_iter().zip(values) {
-        same(name, &floats(found), &of(name), OUTPUT);
+    let (state, networks) = (of("in.state"), &td3.networks);
+    let heard = heard(state.len() / 40 / modules, modules);
+    let (sight, mut memory) = (Sight { modules, observations: &state, heard: &heard }, Memory::default());
+    let actions = td3::act(networks, &td3.actor(), sight, &mut memory);
+    same("actor_action", &actions, &of("out.actor_action"), OUTPUT);
+    let found = td3::values(networks, &td3.critic(), sight, &of("in.action"), &mut memory);
+    for (found, name) in found.iter().zip(values) {
+        same(name, found, &of(name), OUTPUT);
     }
 }
 
@@ -476,14 +477,11 @@ fn smp_is_its_authors() {
     for modules in [5, 11] {
         smp_outputs(&fixture, &td3, &format!("n{modules}."), ["out.q1_perlimb", "out.q2_perlimb"], modules);
     }
-    let target = Weights::new(&layouts[0], &td3.targets[0]);
-    let next = seen(&target, &fixture.get("in.next_state"), &heard(3, 8), 8);
-    same(
-        "target_policy_action",
-        &floats(networks.act(&target, &next)),
-        &fixture.get("out.target_policy_action"),
-        OUTPUT,
-    );
+    let target = Packed::new(&layouts[0], &td3.targets[0]);
+    let next = fixture.get("in.next_state");
+    let sight = Sight { modules: 8, observations: &next, heard: &heard(3, 8) };
+    let actions = td3::act(&networks, &target, sight, &mut Memory::default());
+    same("target_policy_action", &actions, &fixture.get("out.target_policy_action"), OUTPUT);
 
     let batch = Transitions {
         modules: 8,

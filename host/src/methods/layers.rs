@@ -11,7 +11,7 @@ use std::collections::HashMap;
 use std::ops::Range;
 use std::sync::Arc;
 
-use super::kernels::{Start, dense, dense_weights, dot, exp_body, gelu, tanh};
+use super::kernels::{Start, dense, dense_weights, dot, exp_body, gelu, tanh, tanh_and_slope};
 use super::parameters::room;
 use super::simd::{Vector, vectorise};
 use super::tensors::{Activation, Layout};
@@ -133,6 +133,12 @@ pub struct Matrix {
 }
 
 impl Matrix {
+    /// Some of its rows, in place.
+    pub fn rows(self, rows: Range<usize>) -> Self {
+        assert!(rows.end <= self.rows);
+        Self { start: self.start + rows.start * self.stride(), rows: rows.len(), ..self }
+    }
+
     fn stride(self) -> usize {
         padded(self.columns)
     }
@@ -181,6 +187,16 @@ enum Step {
         y: Matrix,
         slope: usize,
     },
+    /// `y = tanh(x)`; the slopes are kept behind y.
+    Tanh { x: Matrix, y: Matrix },
+    /// `y = x / |x|`, row by row; the lengths are kept behind y.
+    Unit { x: Matrix, y: Matrix },
+    /// `y = f x`, a factor for each row.
+    Scaled { x: Matrix, factors: Vec<f32>, y: Matrix },
+    /// Side by side.
+    Beside { parts: Vec<Matrix>, y: Matrix },
+    /// One below the other.
+    Below { parts: Vec<Matrix>, y: Matrix },
     /// `y = n w + b`, n being x (+ plus) with mean 0 and variance 1 in each row, which is kept behind y; then 1 / standard deviation of each row.
     Norm { network: Network, weight: Place, bias: Place, x: Matrix, plus: Option<Matrix>, y: Matrix },
     /// `y_i = sum_j a_ij v_j`, `a_i = softmax(q_i k_j / sqrt(width))`; a is kept behind y.
@@ -303,6 +319,70 @@ impl<'a> Tape<'a> {
         self.note(y, Step::Linear { network, weight, bias, activation, x, y, slope })
     }
 
+    /// The hyperbolic tangent of every number, with a slope that is exact however flat it is, which that of [`Tape::activated`] is not.
+    pub fn tanh(&mut self, x: Matrix) -> Matrix {
+        let y = self.matrix(x.rows, x.columns, x.tracked);
+        self.take(y.len());
+        let (earlier, of_y, slopes) = self.split(y);
+        of_y.copy_from_slice(&earlier[x.range()]);
+        tanh_and_slope(of_y, slopes);
+        self.note(y, Step::Tanh { x, y })
+    }
+
+    /// Every row at unit length.
+    pub fn unit(&mut self, x: Matrix) -> Matrix {
+        let y = self.matrix(x.rows, x.columns, x.tracked);
+        self.take(y.rows);
+        let (earlier, of_y, lengths) = self.split(y);
+        of_y.copy_from_slice(&earlier[x.range()]);
+        to_unit(of_y, lengths);
+        self.note(y, Step::Unit { x, y })
+    }
+
+    /// Every row times a factor.
+    pub fn scaled(&mut self, x: Matrix, factors: Vec<f32>) -> Matrix {
+        if factors.iter().all(|factor| *factor == 1.0) {
+            return x;
+        }
+        let y = self.matrix(x.rows, x.columns, x.tracked);
+        let (earlier, of_y, _) = self.split(y);
+        let rows = earlier[x.range()].chunks_exact(x.stride()).zip(of_y.chunks_exact_mut(x.stride()));
+        for ((x, y), factor) in rows.zip(&factors) {
+            y.iter_mut().zip(x).for_each(|(y, x)| *y = factor * x);
+        }
+        self.note(y, Step::Scaled { x, factors, y })
+    }
+
+    /// Matrices side by side.
+    pub fn beside(&mut self, parts: &[Matrix]) -> Matrix {
+        let columns = parts.iter().map(|part| part.columns).sum();
+        let y = self.matrix(parts[0].rows, columns, parts.iter().any(|part| part.tracked));
+        let (earlier, of_y, _) = self.split(y);
+        for (row, y) in of_y.chunks_exact_mut(y.stride()).enumerate() {
+            let mut column = 0;
+            for part in parts {
+                let from = &earlier[part.start + row * part.stride()..][..part.columns];
+                y[column..column + part.columns].copy_from_slice(from);
+                column += part.columns;
+            }
+            y[column..].fill(0.0);
+        }
+        self.note(y, Step::Beside { parts: parts.to_vec(), y })
+    }
+
+    /// Matrices one below the other.
+    pub fn below(&mut self, parts: &[Matrix]) -> Matrix {
+        let rows = parts.iter().map(|part| part.rows).sum();
+        let y = self.matrix(rows, parts[0].columns, parts.iter().any(|part| part.tracked));
+        let (earlier, mut of_y, _) = self.split(y);
+        for part in parts {
+            let (to, rest) = of_y.split_at_mut(part.len());
+            to.copy_from_slice(&earlier[part.range()]);
+            of_y = rest;
+        }
+        self.note(y, Step::Below { parts: parts.to_vec(), y })
+    }
+
     /// Layer normalisation of each row.
     pub fn norm(&mut self, w: Network, name: &str, x: Matrix) -> Matrix {
         self.norm_of_sum(w, name, x, None)
@@ -389,8 +469,15 @@ impl<'a> Tape<'a> {
             rows.for_each(|(to, of_y)| add(&mut to[..y.columns], of_y));
         }
         for step in steps.iter().rev() {
-            let (Step::Linear { y, .. } | Step::Norm { y, .. } | Step::Attention { y, .. } | Step::Rows { y, .. }) =
-                step;
+            let (Step::Linear { y, .. }
+            | Step::Tanh { y, .. }
+            | Step::Unit { y, .. }
+            | Step::Scaled { y, .. }
+            | Step::Beside { y, .. }
+            | Step::Below { y, .. }
+            | Step::Norm { y, .. }
+            | Step::Attention { y, .. }
+            | Step::Rows { y, .. }) = step;
             // What a step is made of lies before its result, and what it kept behind.
             let (earlier, of_y) = gradients.split_at_mut(y.start);
             let of_y = &mut of_y[..y.len()];
@@ -417,6 +504,39 @@ impl<'a> Tape<'a> {
                             let of_x = &mut earlier[x.range()][block * x_stride..][..x_rows.len()];
                             dense(of_y, y.stride(), back, Start::Sum, of_x);
                         }
+                    }
+                }
+                Step::Tanh { x, y } => {
+                    let slopes = of_y.iter().zip(&behind[..y.len()]);
+                    earlier[x.range()].iter_mut().zip(slopes).for_each(|(of_x, (of_y, slope))| *of_x += of_y * slope);
+                }
+                Step::Unit { x, y } => {
+                    to_unit_backward(&numbers[y.range()], &behind[..y.rows], of_y, &mut earlier[x.range()]);
+                }
+                Step::Scaled { x, factors, y } => {
+                    let rows = earlier[x.range()].chunks_exact_mut(y.stride()).zip(of_y.chunks_exact(y.stride()));
+                    for ((of_x, of_y), factor) in rows.zip(factors) {
+                        of_x.iter_mut().zip(of_y).for_each(|(of_x, of_y)| *of_x += factor * of_y);
+                    }
+                }
+                Step::Beside { parts, y } => {
+                    let mut column = 0;
+                    for part in parts {
+                        for (row, of_y) in of_y.chunks_exact(y.stride()).enumerate().filter(|_| part.tracked) {
+                            let of_part = &mut earlier[part.start + row * part.stride()..][..part.columns];
+                            add(of_part, &of_y[column..column + part.columns]);
+                        }
+                        column += part.columns;
+                    }
+                }
+                Step::Below { parts, .. } => {
+                    let mut of_y = &*of_y;
+                    for part in parts {
+                        let (of_part, rest) = of_y.split_at(part.len());
+                        if part.tracked {
+                            add(&mut earlier[part.range()], of_part);
+                        }
+                        of_y = rest;
                     }
                 }
                 Step::Norm { network, weight, bias, x, plus, y } => {
@@ -513,6 +633,37 @@ fn total(numbers: &[f32], others: &[f32], of: impl Fn(f32, f32) -> f32) -> f32 {
         }
     }
     parts[0]
+}
+
+vectorise! {
+    /// Brings rows to unit length: `x /= |x|`, with the length that each had.
+    fn to_unit(x: &mut [f32], lengths: &mut [f32]) = to_unit_body
+}
+
+#[inline(always)]
+fn to_unit_body<V: Vector>(x: &mut [f32], lengths: &mut [f32]) {
+    let stride = x.len() / lengths.len();
+    for (x, length) in x.chunks_exact_mut(stride).zip(lengths) {
+        *length = total(x, x, |x, _| x * x).sqrt().max(1e-12);
+        x.iter_mut().for_each(|x| *x /= *length);
+    }
+}
+
+vectorise! {
+    /// The way back of [`to_unit`]: `of_x += (of_y - y (y of_y)) / |x|`, y being the row at unit length.
+    fn to_unit_backward(y: &[f32], lengths: &[f32], of_y: &[f32], of_x: &mut [f32]) = to_unit_backward_body
+}
+
+#[inline(always)]
+fn to_unit_backward_body<V: Vector>(y: &[f32], lengths: &[f32], of_y: &[f32], of_x: &mut [f32]) {
+    let stride = y.len() / lengths.len();
+    let rows = y.chunks_exact(stride).zip(of_y.chunks_exact(stride)).zip(of_x.chunks_exact_mut(stride));
+    for (((y, of_y), of_x), length) in rows.zip(lengths) {
+        let along = total(y, of_y, |y, of_y| y * of_y);
+        for ((of_x, of_y), y) in of_x.iter_mut().zip(of_y).zip(y) {
+            *of_x += (of_y - y * along) / length;
+        }
+    }
 }
 
 vectorise! {
@@ -758,6 +909,27 @@ mod tests {
                 compare("activated", layout, [rows, inputs], taped, |w, x| activation.apply(w.linear("a", x)));
             }
         }
+    }
+
+    #[test]
+    fn what_joins_and_scales_rows_is_burns() {
+        let layout = |layout: &mut Layout| layout.linear("a", 20, 5, Scheme::Uniform);
+        let factors = [0.0, 1.0, 0.5, 1.0];
+        let taped = |t: &mut Tape, w, x: Matrix| {
+            let x = t.unit(x);
+            let x = t.tanh(x);
+            let y = t.linear(w, "a", x);
+            let x = t.beside(&[x, y]);
+            let first = t.scaled(x.rows(0..4), factors.to_vec());
+            t.below(&[x.rows(2..6), first])
+        };
+        compare("joined", layout, [6, 20], taped, |w, x| {
+            let length = (x.clone() * x.clone()).sum_dim(1).sqrt();
+            let x = (x / length).tanh();
+            let x = Tensor::cat(vec![x.clone(), w.linear("a", x)], 1);
+            let first = x.clone().narrow(0, 0, 4) * w.tensor(&factors, [4, 1]);
+            Tensor::cat(vec![x.narrow(0, 2, 4), first], 0)
+        });
     }
 
     #[test]

@@ -158,11 +158,6 @@ impl Weights {
         Self { tensors }
     }
 
-    /// The same on the autodiff device, without gradients of their own: what gradients pass through.
-    pub fn passed(layout: &Layout, parameters: &[f32]) -> Self {
-        Self::on(layout, parameters, &Device::flex().autodiff())
-    }
-
     fn on(layout: &Layout, parameters: &[f32], device: &Device) -> Self {
         let tensor = |entry: &Entry| {
             let data = TensorData::new(parameters[entry.range()].to_vec(), [entry.rows, entry.columns]);

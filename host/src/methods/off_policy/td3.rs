@@ -1,24 +1,24 @@
 //! TD3 (Fujimoto et al. 2018): two critics whose lesser counts, noise on the target's action, an actor that is stepped less often, and targets
 //! that follow slowly.
 
+use std::ops::Range;
 use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
-use burn::tensor::Tensor;
 use composer_shared::observation::BASE;
 use rand::{Rng, RngExt};
 
 use super::replay::{ReplayBuffer, Transitions};
 use crate::environment::{Environment, Lesson, Outcome, with_itself};
 use crate::methods::config::TrainConfig;
-use crate::methods::on_policy::autodiff::{Seen, seen};
+use crate::methods::layers::{Matrix, Memory, Network, Packed, Tape};
 use crate::methods::on_policy::collect::{ACTIONS, episode_seed};
 use crate::methods::on_policy::{RolloutWorker, Widths};
 use crate::methods::parameters::Adam;
 use crate::methods::random::{Stream, normal_noise, stream};
 use crate::methods::ranks::Ranks;
-use crate::methods::tensors::{Layout, Weights, floats, scalar};
+use crate::methods::tensors::Layout;
 use crate::methods::{
     Algorithm, EpisodeState, LearnerState, MakeEnvironment, Report, State, Times, TrainedPolicy, checked,
     episode_scalars,
@@ -27,19 +27,99 @@ use crate::methods::{
 /// The paper's observation; nobody remembers anything.
 const WIDTHS: Widths = Widths { inputs: BASE, memory: 0 };
 
+/// What some teams of equal length see.
+#[derive(Clone, Copy, Debug)]
+pub struct Sight<'a> {
+    /// Modules of each team.
+    pub modules: usize,
+    /// Observations, `[teams][module][BASE]`.
+    pub observations: &'a [f32],
+    /// Who heard whom, `[teams][module]`, own bit set.
+    pub heard: &'a [u64],
+}
+
+/// The same on a tape. **The rows of modules at the same place in their teams lie together here**: row `module * teams + team`, so that one
+/// place of all teams is a piece.
+#[derive(Clone, Debug)]
+pub struct Seen {
+    /// Teams.
+    pub teams: usize,
+    /// Modules of each.
+    pub modules: usize,
+    /// Observations, `[rows, BASE]`.
+    pub observations: Matrix,
+    /// Who is heard by each, one mask a row.
+    heard: Vec<u64>,
+}
+
+impl Seen {
+    fn new(t: &mut Tape, sight: Sight) -> Self {
+        let (modules, teams) = (sight.modules, sight.heard.len() / sight.modules);
+        let observations = t.input(&turned(sight.observations, teams, modules), BASE);
+        Self { teams, modules, observations, heard: turned(sight.heard, teams, modules) }
+    }
+
+    /// The rows of one place.
+    pub fn place(&self, module: usize) -> Range<usize> {
+        module * self.teams..(module + 1) * self.teams
+    }
+
+    /// 1 for each team in which module `to` hears module `from`, else 0.
+    pub fn hears(&self, to: usize, from: usize) -> Vec<f32> {
+        self.heard[self.place(to)].iter().map(|heard| (heard >> from & 1) as f32).collect()
+    }
+}
+
+/// What is `[first, second, ..]` as `[second, first, ..]`: from teams of modules to places of teams, or back.
+fn turned<T: Copy>(numbers: &[T], first: usize, second: usize) -> Vec<T> {
+    let width = numbers.len() / (first * second).max(1);
+    let mut turned = Vec::with_capacity(numbers.len());
+    for j in 0..second {
+        for i in 0..first {
+            turned.extend_from_slice(&numbers[(i * second + j) * width..][..width]);
+        }
+    }
+    turned
+}
+
 /// The networks of a deterministic method, as functions of their weights.
 pub trait DeterministicActorCritic: Clone + Send + Sync + 'static {
     /// The actor's parameters, and those of both critics.
     fn layouts(&self) -> [Layout; 2];
 
     /// The actions, `[rows, ACTIONS]`, each within -1 to 1.
-    fn act(&self, actor: &Weights, seen: &Seen) -> Tensor<2>;
+    fn act(&self, t: &mut Tape, actor: Network, seen: &Seen) -> Matrix;
 
-    /// What both critics say of actions, `[rows, 1]` or `[teams, 1]`.
-    fn values(&self, critic: &Weights, seen: &Seen, actions: Tensor<2>) -> [Tensor<2>; 2];
+    /// What the first N critics, of two, say of actions, `[rows, 1]`.
+    fn values<const N: usize>(&self, t: &mut Tape, critic: Network, seen: &Seen, actions: Matrix) -> [Matrix; N];
 
     /// What evaluation runs.
     fn policy(&self, actor: &[f32]) -> TrainedPolicy;
+}
+
+/// The actions of teams, `[teams][module][ACTIONS]`.
+pub fn act<N: DeterministicActorCritic>(networks: &N, actor: &Packed, sight: Sight, memory: &mut Memory) -> Vec<f32> {
+    let mut t = Tape::new(memory);
+    let actor = t.network(actor);
+    let seen = Seen::new(&mut t, sight);
+    let actions = networks.act(&mut t, actor, &seen);
+    turned(&t.numbers(actions), seen.modules, seen.teams)
+}
+
+/// What both critics say of actions of teams, `[teams][module]`.
+pub fn values<N: DeterministicActorCritic>(
+    networks: &N,
+    critic: &Packed,
+    sight: Sight,
+    actions: &[f32],
+    memory: &mut Memory,
+) -> [Vec<f32>; 2] {
+    let mut t = Tape::new(memory);
+    let critic = t.network(critic);
+    let seen = Seen::new(&mut t, sight);
+    let actions = t.input(&turned(actions, seen.teams, seen.modules), ACTIONS);
+    let values: [Matrix; 2] = networks.values(&mut t, critic, &seen, actions);
+    values.map(|value| turned(&t.numbers(value), seen.modules, seen.teams))
 }
 
 /// Settings of TD3.
@@ -100,13 +180,18 @@ pub struct Td3<N> {
     pub targets: [Vec<f32>; 2],
     /// Their optimisers.
     pub adams: [Adam; 2],
+    /// What an update computes with, either of the two above in turn.
+    packed: [Packed; 2],
+    memory: Memory,
 }
 
 impl<N: DeterministicActorCritic> Td3<N> {
     /// With these parameters, whose targets are the same.
     pub fn new(networks: N, online: [Vec<f32>; 2]) -> Self {
         let adams = [0, 1].map(|part: usize| Adam::new(online[part].len(), 1e-8));
-        Self { layouts: networks.layouts(), networks, targets: online.clone(), online, adams }
+        let (layouts, targets, memory) = (networks.layouts(), online.clone(), Memory::default());
+        let packed = [0, 1].map(|part: usize| Packed::new(&layouts[part], &online[part]));
+        Self { networks, layouts, online, targets, adams, packed, memory }
     }
 
     /// One update of the critics and, if `with_actor`, of the actor and all targets; `noise` is that on the targets' actions before it is
@@ -118,43 +203,60 @@ impl<N: DeterministicActorCritic> Td3<N> {
         settings: &Td3Settings,
         with_actor: bool,
     ) -> UpdateStats {
-        let [actor_layout, critic_layout] = &self.layouts;
-        let (modules, rows) = (batch.modules, batch.heard.len());
-        let targets = {
-            let [actor, critic] = [0, 1].map(|part| Weights::new(&self.layouts[part], &self.targets[part]));
-            let next = seen(&actor, &batch.next_observations, &batch.next_heard, modules);
-            let clip = settings.target_noise_clip;
-            let noise = actor.tensor(noise, [rows, ACTIONS]).clamp(-clip, clip);
-            let actions = (self.networks.act(&actor, &next) + noise).clamp(-1.0, 1.0);
-            let [first, second] = self.networks.values(&critic, &next, actions);
-            let values = floats(first.min_pair(second));
-            let each = values.len() / batch.len();
-            let of = |(i, value): (usize, f32)| {
-                let team = i / each;
-                batch.rewards[team] + settings.gamma * (1.0 - batch.done[team]) * value
-            };
-            values.into_iter().enumerate().map(of).collect::<Vec<f32>>()
+        let Self { networks, layouts, online, targets: followers, adams, packed, memory } = self;
+        let [actor, critic] = packed;
+        let (modules, teams) = (batch.modules, batch.len());
+        let rows = batch.heard.len();
+        let share = 1.0 / rows as f32;
+        let gradient = |part: usize, of: &Packed, t: Tape, values: &[(Matrix, &[f32])]| {
+            let (mut sum, mut gradient) = (vec![0.0; of.len()], vec![0.0; layouts[part].len()]);
+            t.backward(values, &mut sum);
+            of.unpack(&sum, &mut gradient);
+            gradient
         };
-        let critic = Weights::tracked(critic_layout, &self.online[1]);
-        let now = seen(&critic, &batch.observations, &batch.heard, modules);
-        let actions = critic.tensor(&batch.actions, [rows, ACTIONS]);
-        let target = critic.tensor(&targets, [targets.len(), 1]);
-        let [first, second] = self.networks.values(&critic, &now, actions).map(|value| value - target.clone());
-        let loss = (first.clone() * first).mean() + (second.clone() * second).mean();
-        let critic_loss = scalar(&loss.clone().inner());
-        let critic_gradient = critic.gradients(critic_layout, &loss);
-        self.adams[1].step(&mut self.online[1], &critic_gradient, settings.learning_rate);
+
+        actor.load(&followers[0]);
+        critic.load(&followers[1]);
+        let next = Sight { modules, observations: &batch.next_observations, heard: &batch.next_heard };
+        let mut actions = act(networks, actor, next, memory);
+        let clip = settings.target_noise_clip;
+        actions.iter_mut().zip(noise).for_each(|(a, noise)| *a = (*a + noise.clamp(-clip, clip)).clamp(-1.0, 1.0));
+        let [first, second] = values(networks, critic, next, &actions, memory);
+        let of = |(row, (first, second)): (usize, (f32, f32))| {
+            let team = row / modules;
+            batch.rewards[team] + settings.gamma * (1.0 - batch.done[team]) * first.min(second)
+        };
+        let targets: Vec<f32> = first.into_iter().zip(second).enumerate().map(of).collect();
+
+        critic.load(&online[1]);
+        let sight = Sight { modules, observations: &batch.observations, heard: &batch.heard };
+        let mut t = Tape::new(memory);
+        let network = t.learning(critic);
+        let now = Seen::new(&mut t, sight);
+        let actions = t.input(&turned(&batch.actions, teams, modules), ACTIONS);
+        let values: [Matrix; 2] = networks.values(&mut t, network, &now, actions);
+        let turned_targets = turned(&targets, teams, modules);
+        let errors = values.map(|value| {
+            t.numbers(value).iter().zip(&turned_targets).map(|(value, target)| value - target).collect::<Vec<f32>>()
+        });
+        let critic_loss = errors.iter().flatten().map(|error| f64::from(share * error * error)).sum();
+        let of = errors.map(|errors| errors.iter().map(|error| 2.0 * share * error).collect::<Vec<f32>>());
+        let critic_gradient = gradient(1, critic, t, &[(values[0], &of[0]), (values[1], &of[1])]);
+        adams[1].step(&mut online[1], &critic_gradient, settings.learning_rate);
         let mut stats = UpdateStats { critic_loss, targets, critic_gradient, ..UpdateStats::default() };
         if with_actor {
+            actor.load(&online[0]);
             // The critic as it is after its step.
-            let actor = Weights::tracked(actor_layout, &self.online[0]);
-            let critic = Weights::passed(critic_layout, &self.online[1]);
-            let [value, _] = self.networks.values(&critic, &now, self.networks.act(&actor, &now));
-            let loss = value.mean().neg();
-            stats.actor_loss = Some(scalar(&loss.clone().inner()));
-            stats.actor_gradient = actor.gradients(actor_layout, &loss);
-            self.adams[0].step(&mut self.online[0], &stats.actor_gradient, settings.learning_rate);
-            for (target, online) in self.targets.iter_mut().zip(&self.online) {
+            critic.load(&online[1]);
+            let mut t = Tape::new(memory);
+            let (learning, passed) = (t.learning(actor), t.network(critic));
+            let now = Seen::new(&mut t, sight);
+            let actions = networks.act(&mut t, learning, &now);
+            let [value] = networks.values(&mut t, passed, &now, actions);
+            stats.actor_loss = Some(-t.numbers(value).iter().map(|value| f64::from(share * value)).sum::<f64>());
+            stats.actor_gradient = gradient(0, actor, t, &[(value, &vec![-share; rows])]);
+            adams[0].step(&mut online[0], &stats.actor_gradient, settings.learning_rate);
+            for (target, online) in followers.iter_mut().zip(&*online) {
                 for (target, online) in target.iter_mut().zip(online) {
                     *target = settings.tau * online + (1.0 - settings.tau) * *target;
                 }
@@ -164,13 +266,13 @@ impl<N: DeterministicActorCritic> Td3<N> {
     }
 
     /// The actor's weights, to act with.
-    pub fn actor(&self) -> Weights {
-        Weights::new(&self.layouts[0], &self.online[0])
+    pub fn actor(&self) -> Packed {
+        Packed::new(&self.layouts[0], &self.online[0])
     }
 
     /// The critics' weights.
-    pub fn critic(&self) -> Weights {
-        Weights::new(&self.layouts[1], &self.online[1])
+    pub fn critic(&self) -> Packed {
+        Packed::new(&self.layouts[1], &self.online[1])
     }
 
     /// The layout of the actor's parameters and of the critics'.
@@ -218,7 +320,7 @@ impl<N: DeterministicActorCritic> OffPolicy<N> {
     }
 
     /// Takes one step in every environment. Returns the transitions and the outcomes of the episodes that ended.
-    fn step(&mut self, actor: &Weights, random: bool, rng: &mut impl Rng) -> (Transitions, Vec<Outcome>) {
+    fn step(&mut self, actor: &Packed, random: bool, rng: &mut impl Rng) -> (Transitions, Vec<Outcome>) {
         let modules = self.environments[0].modules();
         let mut new = Transitions { modules, ..Transitions::default() };
         for worker in &self.environments {
@@ -228,10 +330,11 @@ impl<N: DeterministicActorCritic> OffPolicy<N> {
         new.actions = if random {
             (0..new.heard.len() * ACTIONS).map(|_| rng.random_range(-1.0..1.0)).collect()
         } else {
-            let seen = seen(actor, &new.observations, &new.heard, modules);
             let mut noise = Vec::new();
             normal_noise(rng, new.heard.len(), ACTIONS, &mut noise);
-            let means = floats(self.learner.networks.act(actor, &seen));
+            let Td3 { networks, memory, .. } = &mut self.learner;
+            let sight = Sight { modules, observations: &new.observations, heard: &new.heard };
+            let means = act(networks, actor, sight, memory);
             let explored = |(mean, noise): (f32, f32)| (mean + self.settings.exploration * noise).clamp(-1.0, 1.0);
             means.into_iter().zip(noise).map(explored).collect()
         };
