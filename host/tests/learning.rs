@@ -77,9 +77,14 @@ fn ppo_learns_to_balance() {
 
 #[test]
 fn smp_learns_to_swing_up() {
-    // At random an episode costs some 1,200.
-    let (curve, exact) = train(&smp(6000, [64, 48]), &|| Box::new(Pendulum::default()));
-    assert!(exact > -500.0, "{curve} {exact}");
+    // At random an episode costs some 1,200. After so few steps it is chance which seeds have learnt it, about three of four, whoever computes the
+    // gradients: two of three must.
+    let of_seed = |seed| train(&TrainConfig { seed, ..smp(6000, [64, 48]) }, &|| Box::new(Pendulum::default())).1;
+    let exact: Vec<f64> = std::thread::scope(|scope| {
+        let running = [1, 2, 3].map(|seed| scope.spawn(move || of_seed(seed)));
+        running.map(|thread| thread.join().unwrap()).to_vec()
+    });
+    assert!(exact.iter().filter(|exact| **exact > -500.0).count() >= 2, "{exact:?}");
 }
 
 /// CleanRL: 490 +- 6 after 500,000 steps, the mean return of the last episodes.
