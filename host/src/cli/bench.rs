@@ -123,8 +123,9 @@ fn ways() -> Vec<(String, TrainConfig)> {
         let name = format!("composer, {}", format!("{gradient:?}").to_lowercase());
         (name, TrainConfig { gradient, ..TrainConfig::default() })
     });
-    let baselines = [Method::Mat, Method::MatDec, Method::Smp].map(|method| {
+    let baselines = [Method::Ppo, Method::Mappo, Method::Mat, Method::MatDec, Method::Smp].map(|method| {
         let mut config = TrainConfig { method, ..TrainConfig::default() };
+        (config.ppo.environments, config.ppo.minibatches) = (8, 8);
         (config.mat.environments, config.mat.minibatches) = (8, 8);
         (config.mat_dec.environments, config.mat_dec.minibatches) = (8, 8);
         (config.smp.rollout_steps, config.smp.random_steps) = (4, 0);
