@@ -105,7 +105,9 @@ pub fn publish(results: &Results, out: &Path) -> Result<String> {
     ];
     for run in &results.runs {
         if let Some(figure) = attention(run) {
-            figures.push((format!("attention-{}.svg", run.task.0), "Attention: the paper's Fig. 6", figure));
+            // One heading for all of them.
+            let heading = if figures.len() == 2 { "Attention: the paper's Fig. 6" } else { "" };
+            figures.push((format!("attention-{}.svg", run.task.0), heading, figure));
         }
     }
     let sections = results.sections();
@@ -120,7 +122,8 @@ pub fn publish(results: &Results, out: &Path) -> Result<String> {
     let (first, others) = sections.split_at(1);
     body.extend(first.iter().map(super::sections::Section::html));
     for (_, words, svg) in &figures {
-        body += &format!("<h2>{words}</h2>\n<div class=\"wide figure\">{svg}</div>\n");
+        let heading = if words.is_empty() { String::new() } else { format!("<h2>{words}</h2>\n") };
+        body += &format!("{heading}<div class=\"wide figure\">{svg}</div>\n");
     }
     body.extend(others.iter().map(super::sections::Section::html));
     let replays = replays(results)?;

@@ -102,9 +102,15 @@ impl Results {
         self.runs.iter().filter(wanted).collect()
     }
 
-    /// The methods compared, in the order of the tables.
+    /// The methods compared of which there are runs, in the order of the tables.
     pub fn methods(&self) -> Vec<Method> {
-        ORDER.into_iter().filter(|method| self.comparison.methods.contains(method)).collect()
+        ORDER.into_iter().filter(|method| self.runs.iter().any(|run| run.method == method.name())).collect()
+    }
+
+    /// The others, which have none yet.
+    fn missing(&self) -> Vec<Method> {
+        let missing = |method: &Method| self.comparison.methods.contains(method) && !self.methods().contains(method);
+        ORDER.into_iter().filter(missing).collect()
     }
 
     fn baselines(&self) -> Vec<Method> {
@@ -177,7 +183,11 @@ impl Results {
             self.episodes,
             self.comparison.seeds.iter().map(u64::to_string).collect::<Vec<_>>().join(", "),
         )];
-        if self.comparison.methods.contains(&Method::Smp) {
+        let missing: Vec<_> = self.missing().into_iter().map(title).collect();
+        if !missing.is_empty() {
+            text.push(format!("Of {} there is no run yet.", missing.join(" and ")));
+        }
+        if self.methods().contains(&Method::Smp) {
             text.push(format!(
                 "SMP was given {} updates for each environment step and hidden layers of {} and {}; its authors give it 1, and 400 and 300.",
                 protocol::SMP_UPDATES_PER_STEP, protocol::SMP_WIDTHS[0], protocol::SMP_WIDTHS[1]
