@@ -17,10 +17,10 @@ use crate::eval::Trial;
 use crate::freeze::Parity;
 use crate::methods::composer::float::FloatPolicy;
 use crate::methods::layers::{Memory, Packed, Tape};
+use crate::methods::layout::{Activation, Layout, Scheme};
 use crate::methods::normalise::{Frozen, Running};
 use crate::methods::parameters::Adam;
 use crate::methods::random::{Stream, stream};
-use crate::methods::tensors::{Activation, Layout, Scheme};
 use crate::network::Network;
 use crate::policy::{Memories, Policy};
 

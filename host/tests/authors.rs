@@ -4,6 +4,7 @@
 mod fixture;
 
 use composer_host::methods::layers::{Memory, Packed};
+use composer_host::methods::layout::Layout;
 use composer_host::methods::mappo::Mappo;
 use composer_host::methods::mat::Mat;
 use composer_host::methods::mat_dec::MatDec;
@@ -18,7 +19,7 @@ use composer_host::methods::on_policy::{
 use composer_host::methods::parameters::{Adam, clip_norm};
 use composer_host::methods::ppo::Ppo;
 use composer_host::methods::smp::Smp;
-use composer_host::methods::tensors::{Layout, Weights, floats};
+use composer_host::methods::tensors::{Weights, floats};
 use fixture::{Fixture, near, same};
 
 /// Tolerances of the fixtures: outputs and losses by their largest number, gradients, and weights after a step by the learning rate.

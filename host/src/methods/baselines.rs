@@ -5,6 +5,7 @@ use composer_shared::observation::BASE;
 use serde::{Deserialize, Serialize};
 
 use super::config::TrainConfig;
+use super::layout::Layout;
 use super::mappo::Mappo;
 use super::mat::Mat;
 use super::mat_dec::MatDec;
@@ -16,7 +17,6 @@ use super::on_policy::{ActorCritic, Learner, OnPolicy, OnPolicySettings, Teams};
 use super::ppo::{self, Ppo};
 use super::random::{Stream, stream};
 use super::smp::SmpPolicy;
-use super::tensors::Layout;
 use super::{Algorithm, MakeEnvironment, Method, checked};
 use crate::environment::{View, with_itself};
 use crate::policy::{Memories, Policy};

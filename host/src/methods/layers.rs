@@ -12,9 +12,9 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use super::kernels::{Start, dense, dense_weights, dot, exp_body, gelu, tanh, tanh_and_slope};
+use super::layout::{Activation, Layout};
 use super::parameters::room;
 use super::simd::{Vector, vectorise};
-use super::tensors::{Activation, Layout};
 
 /// Rows are padded to a multiple of this.
 const LANES: usize = 16;
@@ -846,8 +846,9 @@ fn attend_backward_body<V: Vector>(
 mod tests {
     use burn::tensor::Tensor;
 
+    use super::super::layout::Scheme;
     use super::super::random::numbers;
-    use super::super::tensors::{Scheme, Weights, floats};
+    use super::super::tensors::{Weights, floats};
     use super::*;
 
     fn near(what: &str, found: &[f32], expected: &[f32]) {

@@ -22,9 +22,9 @@
 use composer_shared::observation::BASE;
 
 use super::layers::{Matrix, Network, Past, Query, Tape};
+use super::layout::{Activation, Layout, Scheme};
 use super::on_policy::collect::ACTIONS;
 use super::on_policy::taped::{LOG_STD, Seen, TapedNetworks, draw};
-use super::tensors::{Activation, Layout, Scheme};
 use super::{Method, SavedWeights, TrainedPolicy};
 
 /// Width of everything.

@@ -8,10 +8,10 @@
 use composer_shared::observation::BASE;
 
 use super::layers::{Matrix, Network, Tape};
+use super::layout::{Activation, Layout, Scheme};
 use super::mat::{GAINS, WIDTH, encoder_layout, values};
 use super::on_policy::collect::ACTIONS;
 use super::on_policy::taped::{LOG_STD, Seen, TapedNetworks};
-use super::tensors::{Activation, Layout, Scheme};
 use super::{Method, SavedWeights, TrainedPolicy};
 
 /// Encoder for the values, a small network for the actions.

@@ -11,6 +11,7 @@ pub mod curriculum;
 pub mod imagination;
 pub(crate) mod kernels;
 pub mod layers;
+pub mod layout;
 pub mod mappo;
 pub mod mat;
 pub mod mat_dec;

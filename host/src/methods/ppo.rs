@@ -19,11 +19,11 @@
 use composer_shared::observation::BASE;
 
 use super::layers::{Matrix, Network, Tape};
+use super::layout::{Activation, Layout, Scheme};
 use super::on_policy::collect::ACTIONS;
 use super::on_policy::losses::ValueLoss;
 use super::on_policy::taped::{Deviation, Seen, TapedNetworks};
 use super::on_policy::{Ratio, Valued};
-use super::tensors::{Activation, Layout, Scheme};
 use super::{Method, SavedWeights, TrainedPolicy};
 
 /// Modules of the longest snake of the paper's tables.

@@ -24,10 +24,10 @@ use serde::{Deserialize, Serialize};
 
 use super::config::TrainConfig;
 use super::layers::{Matrix, Memory, Network, Packed, Tape};
+use super::layout::{Activation, Layout, Scheme};
 use super::off_policy::td3::{DeterministicActorCritic, OffPolicy, Seen, Sight, Td3, Td3Settings, act, raw};
 use super::on_policy::collect::ACTIONS;
 use super::random::{Stream, stream};
-use super::tensors::{Activation, Layout, Scheme};
 use super::{MakeEnvironment, Method, SavedWeights, TrainedPolicy};
 use crate::environment::{View, with_itself};
 use crate::policy::{Memories, Policy};

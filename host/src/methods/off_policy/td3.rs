@@ -13,12 +13,12 @@ use super::replay::{ReplayBuffer, Transitions};
 use crate::environment::{Environment, Lesson, Outcome, with_itself};
 use crate::methods::config::TrainConfig;
 use crate::methods::layers::{Matrix, Memory, Network, Packed, Tape};
+use crate::methods::layout::Layout;
 use crate::methods::on_policy::collect::{ACTIONS, episode_seed};
 use crate::methods::on_policy::{RolloutWorker, Widths};
 use crate::methods::parameters::Adam;
 use crate::methods::random::{Stream, normal_noise, stream};
 use crate::methods::ranks::Ranks;
-use crate::methods::tensors::Layout;
 use crate::methods::{
     Algorithm, EpisodeState, LearnerState, MakeEnvironment, Report, State, Times, TrainedPolicy, checked,
     episode_scalars,

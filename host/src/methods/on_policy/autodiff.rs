@@ -8,9 +8,10 @@ use super::collect::ACTIONS;
 use super::losses::{ValueLoss, entropy, log_density, policy_loss, value_loss};
 use super::{ActorCritic, Batch, Gradient, Learner, LossSettings, Part, Ratio, Teams, Valued};
 use crate::environment::{View, with_itself};
+use crate::methods::layout::Layout;
 use crate::methods::normalise::{Forgetting, ValueNorm};
 use crate::methods::random::{Stream, stream};
-use crate::methods::tensors::{Layout, Weights, floats, scalar};
+use crate::methods::tensors::{Weights, floats, scalar};
 use crate::methods::{SavedWeights, TrainedPolicy};
 use crate::policy::{Memories, Policy};
 

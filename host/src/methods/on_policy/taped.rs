@@ -10,7 +10,7 @@ use super::losses::{LOG_ROOT_TAU, ValueLoss};
 use super::{ActorCritic, Batch, Gradient, LossSettings, Part, Ratio, Teams, Valued};
 use crate::methods::TrainedPolicy;
 use crate::methods::layers::{Matrix, Memory, Network, Packed, Query, Tape};
-use crate::methods::tensors::Layout;
+use crate::methods::layout::Layout;
 
 /// Name of the parameters that MAT and MAT_dec make the standard deviations of the actions of.
 pub const LOG_STD: &str = "decoder.log_std";
