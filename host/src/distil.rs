@@ -6,14 +6,11 @@
 //! (DAgger; Ross, Gordon and Bagnell 2011), so that the learner knows its way where its own errors lead it. What that costs is told beside
 //! what the integers cost ([`parity`]).
 
-use std::sync::Mutex;
-
 use composer_shared::observation::BASE;
 use composer_shared::policy::{CLIP, EMBED, HIDDEN, OUT, Policy as Image};
 use rand::RngExt;
 
-use crate::environment::View;
-use crate::eval::Trial;
+use crate::eval::{Trial, run_episode};
 use crate::freeze::Parity;
 use crate::methods::composer::float::FloatPolicy;
 use crate::methods::layers::{Memory, Packed, Tape};
@@ -42,38 +39,17 @@ struct Samples {
     actions: Vec<[f32; OUT]>,
 }
 
-/// Drives with one policy and asks another what it would do.
-struct Asking<'a> {
-    drives: &'a dyn Policy,
-    knows: &'a dyn Policy,
-    heard: Mutex<Samples>,
-}
-
-impl Policy for Asking<'_> {
-    fn act(
-        &self,
-        view: &View,
-        noise: u64,
-        memories: &mut Memories,
-        actions: &mut Vec<[f32; 2]>,
-        attention: Option<&mut Vec<f32>>,
-    ) {
-        self.knows.act(view, noise, &mut Memories::default(), actions, None);
-        if let Ok(mut heard) = self.heard.lock() {
-            heard.observations.extend(view.observations.iter().filter_map(|o| o.first_chunk::<BASE>()));
-            heard.actions.extend(actions.iter().map(|torques| torques.map(|torque| torque.clamp(-1.0, 1.0))));
-        }
-        self.drives.act(view, noise, memories, actions, attention);
-    }
-}
-
 /// What `knows` would do in the episodes of a trial that `drives` drives, in their order.
 fn ask(trial: &Trial, drives: &dyn Policy, knows: &dyn Policy) -> Samples {
     // An episode at a time: its samples stay together, whatever the number of threads.
     let episodes = trial.run(|env, seed, faults| {
-        let asking = Asking { drives, knows, heard: Mutex::default() };
-        crate::eval::run_episode(env, &asking, seed, faults, |_, _| {});
-        asking.heard.into_inner().unwrap_or_default()
+        let (mut samples, mut actions) = (Samples::default(), Vec::new());
+        run_episode(env, drives, seed, faults, |_, view| {
+            knows.act(view, 0, &mut Memories::default(), &mut actions, None);
+            samples.observations.extend(view.observations.iter().filter_map(|o| o.first_chunk::<BASE>()));
+            samples.actions.extend(actions.iter().map(|torques| torques.map(|torque| torque.clamp(-1.0, 1.0))));
+        });
+        samples
     });
     let mut all = Samples::default();
     for Samples { observations, actions } in episodes {

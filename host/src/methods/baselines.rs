@@ -9,13 +9,12 @@ use super::layout::Layout;
 use super::mappo::Mappo;
 use super::mat::Mat;
 use super::mat_dec::MatDec;
-use super::normalise::{Forgetting, ValueNorm};
+use super::normalise::Forgetting;
 use super::on_policy::collect::ACTIONS;
-use super::on_policy::taped::{Scratch, Taped, TapedNetworks};
+use super::on_policy::taped::{Taped, TapedNetworks};
 use super::on_policy::update::Standardise;
 use super::on_policy::{ActorCritic, Learner, OnPolicy, OnPolicySettings, Teams};
 use super::ppo::{self, Ppo};
-use super::random::{Stream, stream};
 use super::smp::SmpPolicy;
 use super::{Algorithm, MakeEnvironment, Method, checked};
 use crate::environment::{View, with_itself};
@@ -177,11 +176,7 @@ fn check(section: &str, settings: &OnPolicySettings) -> Result<()> {
 
 /// A learner of `networks` that has learnt nothing.
 pub fn learner<N: TapedNetworks>(networks: N, seed: u64, forgetting: Forgetting, rate: f64) -> Learner<Taped<N>> {
-    let initial = |layout: &Layout, part| layout.initial(&mut stream(seed, Stream::Weights, 2, part));
-    let [actor, critic] = networks.layouts();
-    let (actor, critic) = (initial(&actor, 0), initial(&critic, 1));
-    let networks = Taped::new(networks, [&actor[..], &critic].concat());
-    Learner::new(networks, seed, actor, critic, ValueNorm::new(forgetting), 1e-5, rate as f32)
+    Learner::untrained(networks.layouts(), |parameters| Taped::new(networks, parameters), seed, forgetting, rate)
 }
 
 /// The modules that all environments have, for a method whose critic is made for a number of them.
@@ -319,7 +314,7 @@ impl SavedWeights {
     }
 
     fn with<N: TapedNetworks>(&self, networks: N) -> Box<dyn Policy + '_> {
-        Box::new(TapedPolicy::new(self, networks))
+        Box::new(MeanPolicy::new(self, Taped::new(networks, self.parameters.clone())))
     }
 }
 
@@ -328,19 +323,19 @@ fn parameters_of(networks: &impl TapedNetworks) -> usize {
 }
 
 /// Networks that act without noise.
-pub struct TapedPolicy<'a, N> {
+pub struct MeanPolicy<'a, C> {
     saved: &'a SavedWeights,
-    networks: Taped<N>,
+    networks: C,
 }
 
-impl<'a, N: TapedNetworks> TapedPolicy<'a, N> {
-    /// With the weights that were saved of them.
-    pub fn new(saved: &'a SavedWeights, networks: N) -> Self {
-        Self { saved, networks: Taped::new(networks, saved.parameters.clone()) }
+impl<'a, C: ActorCritic> MeanPolicy<'a, C> {
+    /// Networks with the weights that were saved of them.
+    pub fn new(saved: &'a SavedWeights, networks: C) -> Self {
+        Self { saved, networks }
     }
 }
 
-impl<N: TapedNetworks> Policy for TapedPolicy<'_, N> {
+impl<C: ActorCritic> Policy for MeanPolicy<'_, C> {
     fn act(
         &self,
         view: &View,
@@ -356,7 +351,7 @@ impl<N: TapedNetworks> Policy for TapedPolicy<'_, N> {
         let teams =
             Teams { observations: &observations[..n * BASE], privileged: &[], heard: &heard[..n], modules: &[n] };
         let (mut means, mut densities) = (Vec::new(), Vec::new());
-        self.networks.sample(teams, &vec![0.0; n * ACTIONS], &mut Scratch::default(), &mut means, &mut densities);
+        self.networks.sample(teams, &vec![0.0; n * ACTIONS], &mut C::Scratch::default(), &mut means, &mut densities);
         actions.clear();
         actions.extend_from_slice(means.as_chunks::<ACTIONS>().0);
         actions.resize(all, [0.0; ACTIONS]);

@@ -108,7 +108,7 @@ impl Method {
 
     /// Whether its modules act alone, on their own observations, by a network that is not of the image's form: such a one can learn what theirs
     /// does ([`crate::distil`]).
-    fn acts_alone(self) -> bool {
+    pub(crate) fn acts_alone(self) -> bool {
         matches!(self, Method::Mappo | Method::MatDec)
     }
 

@@ -105,9 +105,7 @@ pub fn publish(results: &Results, out: &Path) -> Result<String> {
     ];
     for run in &results.runs {
         if let Some(figure) = attention(run) {
-            // One heading for all of them.
-            let heading = if figures.len() == 2 { "Attention: the paper's Fig. 6" } else { "" };
-            figures.push((format!("attention-{}.svg", run.task.0), heading, figure));
+            figures.push((format!("attention-{}.svg", run.task.0), "Attention: the paper's Fig. 6", figure));
         }
     }
     let sections = results.sections();
@@ -121,9 +119,9 @@ pub fn publish(results: &Results, out: &Path) -> Result<String> {
     let mut body = String::new();
     let (first, others) = sections.split_at(1);
     body.extend(first.iter().map(super::sections::Section::html));
-    for (_, words, svg) in &figures {
-        let heading = if words.is_empty() { String::new() } else { format!("<h2>{words}</h2>\n") };
-        body += &format!("{heading}<div class=\"wide figure\">{svg}</div>\n");
+    for alike in figures.chunk_by(|(_, words, _), (_, next, _)| words == next) {
+        body += &format!("<h2>{}</h2>\n", alike[0].1);
+        body.extend(alike.iter().map(|(_, _, svg)| format!("<div class=\"wide figure\">{svg}</div>\n")));
     }
     body.extend(others.iter().map(super::sections::Section::html));
     let replays = replays(results)?;

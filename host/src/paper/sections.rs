@@ -441,8 +441,7 @@ impl Results {
             100.0 * LOST
         )];
         let tasks = &self.comparison.tasks;
-        let learnt: Vec<_> =
-            [Method::Mappo, Method::MatDec].into_iter().filter(|m| self.methods().contains(m)).map(title).collect();
+        let learnt: Vec<_> = self.methods().into_iter().filter(|method| method.acts_alone()).map(title).collect();
         if !learnt.is_empty() {
             text.push(format!(
                 "The image of a module has no room for layers that are normalised: what goes onto the bus of {} is a network of COMPOSER's form without attention \

@@ -7,13 +7,10 @@ use composer_shared::observation::BASE;
 use super::collect::ACTIONS;
 use super::losses::{ValueLoss, entropy, log_density, policy_loss, value_loss};
 use super::{ActorCritic, Batch, Gradient, Learner, LossSettings, Part, Ratio, Teams, Valued};
-use crate::environment::{View, with_itself};
+use crate::methods::TrainedPolicy;
 use crate::methods::layout::Layout;
-use crate::methods::normalise::{Forgetting, ValueNorm};
-use crate::methods::random::{Stream, stream};
+use crate::methods::normalise::Forgetting;
 use crate::methods::tensors::{Weights, floats, scalar};
-use crate::methods::{SavedWeights, TrainedPolicy};
-use crate::policy::{Memories, Policy};
 
 /// What some teams of equal length see, as tensors.
 #[derive(Clone, Debug)]
@@ -60,11 +57,6 @@ pub trait TensorNetworks: Clone + Send + Sync + 'static {
         ACTIONS
     }
 
-    /// The most modules that it can decide for, if there is a limit.
-    fn most_modules(&self) -> Option<usize> {
-        None
-    }
-
     /// Means and standard deviations of the actions, and the values, given the actions that were taken, `[rows, outputs]`.
     fn evaluate(&self, weights: &Weights, seen: &Seen, actions: Tensor<2>) -> Evaluation;
 
@@ -102,12 +94,11 @@ pub struct Autodiff<N> {
 }
 
 impl<N: TensorNetworks> Autodiff<N> {
-    /// Networks of zeros.
-    pub fn new(networks: N) -> Self {
+    /// Networks with these parameters, the actor's part first.
+    pub fn new(networks: N, parameters: Vec<f32>) -> Self {
         let [actor, critic] = networks.layouts();
         let of_actor = actor.len();
         let layout = actor.followed_by(&critic);
-        let parameters = vec![0.0; layout.len()];
         Self { weights: Weights::new(&layout, &parameters), networks, layout, of_actor, parameters }
     }
 
@@ -272,47 +263,5 @@ impl<N: TensorNetworks> ActorCritic for Autodiff<N> {
 
 /// A learner of `networks` that has learnt nothing.
 pub fn learner<N: TensorNetworks>(networks: N, seed: u64, forgetting: Forgetting, rate: f64) -> Learner<Autodiff<N>> {
-    let [actor, critic] = networks.layouts();
-    let initial = |layout: &Layout, part| layout.initial(&mut stream(seed, Stream::Weights, 2, part));
-    let (actor, critic) = (initial(&actor, 0), initial(&critic, 1));
-    Learner::new(Autodiff::new(networks), seed, actor, critic, ValueNorm::new(forgetting), 1e-5, rate as f32)
-}
-
-/// Networks that act without noise.
-pub struct TensorPolicy<'a, N> {
-    saved: &'a SavedWeights,
-    networks: N,
-    weights: Weights,
-}
-
-impl<'a, N: TensorNetworks> TensorPolicy<'a, N> {
-    /// With the weights that were saved of them.
-    pub fn new(saved: &'a SavedWeights, networks: N) -> Self {
-        let [actor, critic] = networks.layouts();
-        let weights = Weights::new(&actor.followed_by(&critic), &saved.parameters);
-        Self { saved, networks, weights }
-    }
-}
-
-impl<N: TensorNetworks> Policy for TensorPolicy<'_, N> {
-    fn act(
-        &self,
-        view: &View,
-        _noise: u64,
-        _memories: &mut Memories,
-        actions: &mut Vec<[f32; 2]>,
-        _attention: Option<&mut Vec<f32>>,
-    ) {
-        let all = view.observations.len();
-        // Modules beyond those that the networks are made for hang limp.
-        let n = self.networks.most_modules().map_or(all, |most| all.min(most));
-        let heard: Vec<u64> = with_itself(&view.heard[..n]).collect();
-        let observations = self.saved.normalised(view);
-        let seen = seen(&self.weights, &observations[..n * BASE], &heard, n);
-        let noise = self.weights.tensor(&vec![0.0; n * ACTIONS], [n, ACTIONS]);
-        let means = floats(self.networks.act(&self.weights, &seen, noise).0);
-        actions.clear();
-        actions.extend_from_slice(means.as_chunks::<ACTIONS>().0);
-        actions.resize(all, [0.0; ACTIONS]);
-    }
+    Learner::untrained(networks.layouts(), |parameters| Autodiff::new(networks, parameters), seed, forgetting, rate)
 }

@@ -151,6 +151,11 @@ pub trait ActorCritic: Send + Sync + 'static {
     /// Actions of a module.
     fn outputs(&self) -> usize;
 
+    /// The most modules that it can decide for, if there is a limit.
+    fn most_modules(&self) -> Option<usize> {
+        None
+    }
+
     /// Numbers that a module remembers from one step to the next.
     fn memory(&self) -> usize {
         0

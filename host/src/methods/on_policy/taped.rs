@@ -208,11 +208,6 @@ impl<N: TapedNetworks> Taped<N> {
         &self.parameters
     }
 
-    /// The most modules that it can decide for, if there is a limit.
-    pub fn most_modules(&self) -> Option<usize> {
-        self.networks.most_modules()
-    }
-
     fn log_std(&self) -> &[f32] {
         &self.parameters[self.layout.range(self.networks.log_std().0)]
     }
@@ -379,6 +374,10 @@ impl<N: TapedNetworks> ActorCritic for Taped<N> {
 
     fn outputs(&self) -> usize {
         ACTIONS
+    }
+
+    fn most_modules(&self) -> Option<usize> {
+        self.networks.most_modules()
     }
 
     fn ratio(&self) -> Ratio {

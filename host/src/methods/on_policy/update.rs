@@ -8,6 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use super::buffer::{Batch, Decisions, Trajectory, gather};
 use super::{ActorCritic, Gradient, LossSettings, Part, Teams};
 use crate::environment::PRIVILEGED;
+use crate::methods::layout::Layout;
 use crate::methods::normalise::{Forgetting, ValueNorm};
 use crate::methods::parameters::{Adam, clip_norm};
 use crate::methods::random::{Stream, stream};
@@ -127,6 +128,20 @@ impl<C: ActorCritic> Learner<C> {
             value_norm,
             learning_rate,
         }
+    }
+
+    /// The same of networks made `with` parameters of these layouts, the actor's part first.
+    pub fn untrained(
+        layouts: [Layout; 2],
+        with: impl FnOnce(Vec<f32>) -> C,
+        seed: u64,
+        forgetting: Forgetting,
+        rate: f64,
+    ) -> Self {
+        let initial = |part: usize| layouts[part].initial(&mut stream(seed, Stream::Weights, 2, part as u64));
+        let [actor, critic] = [initial(0), initial(1)];
+        let networks = with([&actor[..], &critic].concat());
+        Self::new(networks, seed, actor, critic, ValueNorm::new(forgetting), 1e-5, rate as f32)
     }
 
     /// Standard deviation of the actions as it is now, mean over their dimensions.
