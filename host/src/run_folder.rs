@@ -221,8 +221,31 @@ pub fn metrics(folder: &Path) -> Result<Vec<Value>> {
         .collect()
 }
 
-/// Wall time that the last line of a run's metrics tells, s.
+/// Wall time that a run has taken by its metrics, s; 0 without any. Each time that it was resumed they count from 0 again.
 pub fn wall_seconds(run: &Path) -> f64 {
-    let last = metrics(run).ok().and_then(|lines| lines.last().and_then(|line| line["time/wall_seconds"].as_f64()));
-    last.unwrap_or(0.0)
+    let times = metrics(run).unwrap_or_default();
+    whole_time(times.iter().filter_map(|line| line["time/wall_seconds"].as_f64()))
+}
+
+/// What a clock that begins again now and then has counted altogether.
+fn whole_time(readings: impl Iterator<Item = f64>) -> f64 {
+    let (before, last) = readings.fold((0.0, 0.0), |(before, last), now| match now < last {
+        true => (before + last, now),
+        false => (before, now),
+    });
+    before + last
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_time_before_an_interruption_counts() {
+        let folder = tempfile::tempdir().unwrap();
+        assert_eq!(wall_seconds(folder.path()), 0.0);
+        let lines = [1.0, 2.5, 0.5, 0.25, 4.0].map(|time| format!("{{\"time/wall_seconds\":{time}}}\n"));
+        std::fs::write(folder.path().join(log::FILE), lines.concat()).unwrap();
+        assert_eq!(wall_seconds(folder.path()), 2.5 + 0.5 + 4.0);
+    }
 }

@@ -184,7 +184,8 @@ pub struct Expectations {
     /// interval (Wilson) lies below.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub success_rate: Option<f64>,
-    /// So many control cycles after a module was unplugged nobody believes it alive any more.
+    /// So many whole control cycles after a module was unplugged nobody believes it alive any more; the one in which it was unplugged does not
+    /// count.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub dead_seen_within: Option<u32>,
     /// So long after a module was plugged in again all believe it alive, and it attends to others.

@@ -12,6 +12,7 @@ use crate::paper::publish::publish;
 use crate::paper::tune::{FILE, Tuned};
 use crate::paper::work::{tune, work};
 use crate::paper::{Comparison, protocol};
+use crate::run_folder::wall_seconds;
 use crate::shard::Shard;
 
 /// Arguments of `report paper`.
@@ -96,6 +97,9 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     }
     let outs = if arguments.merge.is_empty() { vec![runs] } else { arguments.merge.clone() };
     let tables = publish(&gather(&comparison, &outs, episodes, arguments.so_far)?, &out)?;
-    println!("{tables}\nwritten to {}", out.display());
+    let runs = comparison.runs()?;
+    let trained = runs.iter().flat_map(|run| outs.iter().map(|out| wall_seconds(&run.folder(out)))).sum::<f64>();
+    println!("{tables}\n{:.1} hours of training, each run on its share of the cores", trained / 3600.0);
+    println!("written to {}", out.display());
     Ok(())
 }
