@@ -93,7 +93,8 @@ impl Run {
 
 impl Comparison {
     /// All runs: those of the first seed, then of the next; of one seed method by method, the cheap ones first. Whatever is stopped, all methods
-    /// that are done have the same tasks and seeds behind them.
+    /// that are done have the same tasks and seeds behind them. Then once more those for which tuning has found other
+    /// settings.
     ///
     /// # Errors
     ///
@@ -113,14 +114,24 @@ impl Comparison {
             }
         }
         if let Some(tuned) = &self.tuned {
+            let mut any = false;
             for mut run in runs.clone() {
-                for setting in tuned.of(run.task(), run.method())? {
+                let Some(settings) = tuned.of(run.task(), run.method()) else { continue };
+                any = true;
+                // With its own settings a method has a run already.
+                if settings.is_empty() {
+                    continue;
+                }
+                for setting in settings {
                     run.config.set(setting)?;
                 }
                 run.config.validate()?;
                 run.name = format!("{}-{}-tuned-{}", run.task(), run.method(), run.seed());
                 run.tuned = true;
                 runs.push(run);
+            }
+            if !any {
+                bail!("none of these methods has been tuned on any of these tasks");
             }
         }
         if let Some(twice) =
@@ -159,6 +170,19 @@ mod tests {
             let error = text.parse::<Shard>().unwrap_err();
             assert!(error.contains(text) && !error.contains('\n'), "{error}");
         }
+        let settings = [(
+            Task::GoalReaching.name().into(),
+            [("mat".into(), vec!["mat.clip=0.1".into()]), ("smp".into(), vec![])].into(),
+        )]
+        .into();
+        let tuned = Some(Tuned { trials: 1, settings });
+        let runs = Comparison { tuned: tuned.clone(), ..Comparison::default() }.runs().unwrap();
+        assert_eq!(
+            (runs.len(), &*runs[120].name, runs[120].config.train.mat.clip),
+            (123, "goal-reaching-mat-tuned-1", 0.1)
+        );
+        let elsewhere = Comparison { tuned, tasks: vec![Task::WallClimbing], ..Comparison::default() };
+        assert!(elsewhere.runs().unwrap_err().to_string().contains("has been tuned"));
         let twice = Comparison { seeds: vec![1, 1], ..Comparison::default() };
         assert!(twice.runs().unwrap_err().to_string().contains("asked for twice"));
     }

@@ -383,23 +383,29 @@ impl Results {
     }
 
     fn tuned(&self, tuned: &Tuned) -> Section {
-        let tasks = &self.comparison.tasks;
+        let methods = self.methods();
+        let there = |task: &&Task| methods.iter().any(|method| tuned.of(**task, *method).is_some());
+        let tasks: Vec<Task> = self.comparison.tasks.iter().filter(there).copied().collect();
         let mut rows = Vec::new();
-        for method in self.methods() {
+        for &method in &methods {
             let of = |task: &Task| {
-                let runs = self.having(method, *task, true);
+                let settings = tuned.of(*task, method)?;
+                let runs = self.having(method, *task, !settings.is_empty());
                 let cells = runs.iter().filter_map(|run| run.cell(healthy()));
                 let success: Vec<f64> = cells.map(|cell| cell.success_rate).collect();
-                let settings = tuned.of(*task, method).unwrap_or_default().join(", ");
-                let settings = if settings.is_empty() { "its own".into() } else { settings };
-                format!("{}; {settings}", spread(&success, 2, self.comparison.seeds.len()))
+                let settings = if settings.is_empty() { "its own".into() } else { settings.join(", ") };
+                Some(format!("{}; {settings}", spread(&success, 2, self.comparison.seeds.len())))
             };
-            rows.push(std::iter::once(title(method).into()).chain(tasks.iter().map(of)).collect());
+            let cells: Vec<_> = tasks.iter().map(of).collect();
+            if cells.iter().any(Option::is_some) {
+                let cells = cells.into_iter().map(|cell| cell.unwrap_or_else(|| "-".into()));
+                rows.push(std::iter::once(title(method).into()).chain(cells).collect());
+            }
         }
         Section {
             title: "With settings tuned equally".into(),
             text: vec![format!(
-                "Every method had {} trials on every task, of half the steps each, with seeds that are used for nothing else; the best settings were \
+                "Every method here had {} trials on each of these tasks, of half the steps each, with seeds that are used for nothing else; the best settings were \
                  trained anew with the seeds of the comparison. Success on eight healthy modules, and the settings.",
                 tuned.trials
             )],

@@ -111,15 +111,9 @@ impl Tuned {
         serde_json::from_slice(&text).with_context(|| format!("{} holds no tuned settings", path.display()))
     }
 
-    /// Those of a method on a task.
-    ///
-    /// # Errors
-    ///
-    /// If they have not been tuned.
-    pub fn of(&self, task: Task, method: Method) -> Result<&[String]> {
-        let found = self.settings.get(task.name()).and_then(|methods| methods.get(method.name()));
-        let Some(settings) = found else { bail!("the settings of {method} on {task} have not been tuned") };
-        Ok(settings)
+    /// Those of a method on a task; none if it has not been tuned there.
+    pub fn of(&self, task: Task, method: Method) -> Option<&[String]> {
+        Some(self.settings.get(task.name())?.get(method.name())?)
     }
 }
 
