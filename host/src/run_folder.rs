@@ -223,12 +223,8 @@ pub fn metrics(folder: &Path) -> Result<Vec<Value>> {
 
 /// Wall time that a run has taken by its metrics, s; 0 without any. Each time that it was resumed they count from 0 again.
 pub fn wall_seconds(run: &Path) -> f64 {
-    let times = metrics(run).unwrap_or_default();
-    whole_time(times.iter().filter_map(|line| line["time/wall_seconds"].as_f64()))
-}
-
-/// What a clock that begins again now and then has counted altogether.
-fn whole_time(readings: impl Iterator<Item = f64>) -> f64 {
+    let lines = metrics(run).unwrap_or_default();
+    let readings = lines.iter().filter_map(|line| line["time/wall_seconds"].as_f64());
     let (before, last) = readings.fold((0.0, 0.0), |(before, last), now| match now < last {
         true => (before + last, now),
         false => (before, now),

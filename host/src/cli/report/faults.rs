@@ -342,16 +342,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let configs = concat!(env!("CARGO_MANIFEST_DIR"), "/configs/robust");
         let line = |mastered: &str| {
-            let set = [
-                "environments=4",
-                "rollout_steps=32",
-                "minibatches=2",
-                "epochs=1",
-                "critic_epochs=1",
-                "inputs=40",
-                "memory=0",
-                "distance_bias=false",
-            ];
+            let set = ["environments=4", "rollout_steps=32", "minibatches=2", "epochs=1", "critic_epochs=1"];
             let set = set.map(|setting| format!("--set={setting}"));
             let fixed =
                 ["x", "--specialists", "--episodes=2", "--specialist-steps=256", "--configs", configs, "--mastered"];
