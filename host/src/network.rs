@@ -169,6 +169,11 @@ impl Network {
         if ![BASE, SIZE].contains(&self.inputs) {
             return Err(NetworkError::Inputs(self.inputs));
         }
+        self.check_numbers(OUT)
+    }
+
+    /// The same but for the inputs, of a network with so many outputs.
+    pub fn check_numbers(&self, outputs: usize) -> Result<(), NetworkError> {
         if ![0, MEMORY].contains(&self.memory) {
             return Err(NetworkError::Memory(self.memory));
         }
@@ -183,7 +188,8 @@ impl Network {
             }
         }
         let shape = |dense: &Dense| (dense.inputs, dense.outputs, dense.weights.len(), dense.bias.len());
-        let zeros = Network::zeros_of(self.attention, self.inputs, self.memory);
+        let mut zeros = Network::zeros_of(self.attention, self.inputs, self.memory);
+        zeros.output = Dense::zeros(HIDDEN, outputs, true);
         for ((name, dense), (_, wanted)) in self.layers().into_iter().zip(zeros.layers()) {
             let (found, wanted) = (shape(dense), shape(wanted));
             if found != wanted {

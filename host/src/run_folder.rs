@@ -207,7 +207,7 @@ pub fn freeze_run(folder: &Path, episodes: u64, threads: usize) -> Result<(RunCo
     let held_out = Trial { seed: HELD_OUT_SEED, ..trial };
     let parity = match &policy {
         TrainedPolicy::Composer(network) => parity(network, &frozen, &held_out.observations(&*decides)),
-        TrainedPolicy::Weights(_) => distil::parity(&*decides, &frozen, &held_out),
+        _ => distil::parity(&*decides, &frozen, &held_out),
     };
     Ok((config, image, parity))
 }

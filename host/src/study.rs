@@ -32,7 +32,7 @@ pub struct Variant {
 }
 
 /// All variants in the order of the table. From the third on each is the second's with what its words say.
-pub const VARIANTS: [Variant; 9] = [
+pub const VARIANTS: [Variant; 10] = [
     Variant { name: "without", words: "without imagination", against: None },
     Variant { name: "as-it-is", words: "as it is: a target a step", against: Some("without") },
     Variant {
@@ -54,6 +54,7 @@ pub const VARIANTS: [Variant; 9] = [
     Variant { name: "own-targets", words: "held, imagined by each module's own place", against: Some("without") },
     Variant { name: "feasible", words: "held, imagination pays for what was missed", against: Some("without") },
     Variant { name: "attends", words: "held, the imagination attends", against: Some("without") },
+    Variant { name: "told", words: "held, the control policy is told what is imagined", against: Some("without") },
 ];
 
 impl Variant {
@@ -79,6 +80,7 @@ impl Variant {
             "own-targets" => imagination.own_targets = true,
             "feasible" => imagination.feasible = 0.5,
             "attends" => imagination.attention = true,
+            "told" => imagination.told = true,
             _ => {}
         }
         if self.name.ends_with("table-one") {
@@ -210,7 +212,7 @@ mod tests {
         for variant in VARIANTS {
             assert!(variant.against.is_none_or(|name| VARIANTS.iter().any(|other| other.name == name)));
         }
-        assert_eq!(runs(Path::new("x"), &TASKS, 6, 1000).len(), 9 * 3 * 6);
+        assert_eq!(runs(Path::new("x"), &TASKS, 6, 1000).len(), 10 * 3 * 6);
     }
 
     #[test]

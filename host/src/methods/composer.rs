@@ -22,6 +22,7 @@ pub mod float;
 pub mod fused;
 #[cfg(test)]
 mod tests;
+pub mod told;
 
 use std::path::Path;
 
@@ -30,8 +31,9 @@ use serde::{Deserialize, Serialize};
 
 use self::actor::{Actor, ActorLayout, ActorScratch, Remembered, Shape, log_probability};
 use self::critic::{Critic, CriticLayout, CriticScratch};
+use self::told::ToldNetworks;
 use super::config::TrainConfig;
-use super::imagination::{DISPLACEMENT, Imagination};
+use super::imagination::{DISPLACEMENT, Imagination, TOLD_INPUTS};
 use super::normalise::{CLIP, Forgetting, ValueNorm};
 use super::on_policy::collect::ACTIONS;
 use super::on_policy::update::Standardise;
@@ -64,6 +66,8 @@ pub struct Networks {
     pub critic: Critic,
     /// Who computes the gradients.
     pub gradient: Differentiation,
+    /// Numbers of an observation that they look at, the first; the weights of others stay zero.
+    seen: usize,
 }
 
 /// Working memory of both.
@@ -81,13 +85,32 @@ impl Networks {
             actor: Actor::new(layout, &vec![0.0; layout.len]),
             critic: Critic::new(critic, &vec![0.0; critic.len]),
             gradient,
+            seen: shape.inputs,
+        }
+    }
+
+    /// The same that look at the first numbers of an observation alone.
+    pub fn seeing(self, seen: usize) -> Self {
+        Self { seen, ..self }
+    }
+
+    /// Zeros for what they do not look at, in parameters or a gradient.
+    fn hide(&self, part: Part, parameters: &mut [f32]) {
+        let first = match part {
+            Part::Actor => self.actor.layout().encoder,
+            Part::Critic => self.critic.layout().first,
+        };
+        for row in parameters[first.range()].chunks_exact_mut(first.columns) {
+            row[self.seen..self.inputs()].fill(0.0);
         }
     }
 
     /// A learner with initial weights; `sigma` is the standard deviation of the actions, `value_gain` the gain of the critic's output.
     pub fn learner(self, seed: u64, sigma: f32, value_gain: f32, epsilon: f32, learning_rate: f32) -> Learner<Self> {
-        let actor = self.actor.layout().initial(seed, sigma);
-        let critic = self.critic.layout().initial(seed, value_gain);
+        let mut actor = self.actor.layout().initial(seed, sigma);
+        let mut critic = self.critic.layout().initial(seed, value_gain);
+        self.hide(Part::Actor, &mut actor);
+        self.hide(Part::Critic, &mut critic);
         Learner::new(self, seed, actor, critic, ValueNorm::new(Forgetting::Iterations), epsilon, learning_rate)
     }
 }
@@ -220,6 +243,7 @@ impl ActorCritic for Networks {
             }
             Part::Critic => self.critic.finish(sum, ordered, to),
         }
+        self.hide(part, to);
     }
 
     fn floor_sigma(&self, parameters: &mut [f32], sigma: f32) {
@@ -232,7 +256,12 @@ impl ActorCritic for Networks {
     }
 
     fn policy(&self, mean: &[f32], std: &[f32]) -> TrainedPolicy {
-        TrainedPolicy::Composer(Box::new(self.actor.layout().network(self.actor.parameters(), mean, std)))
+        TrainedPolicy::Composer(Box::new(self.actor.network(mean, std)))
+    }
+
+    fn told_policy(&self, companion: &Self, mean: &[f32], std: &[f32]) -> TrainedPolicy {
+        let (control, imagination) = (self.actor.network(mean, std), companion.actor.network(mean, std));
+        TrainedPolicy::Told(Box::new(ToldNetworks { control, imagination }))
     }
 }
 
@@ -240,8 +269,10 @@ impl ActorCritic for Networks {
 pub fn new(config: &TrainConfig, make: MakeEnvironment) -> Result<OnPolicy<Networks>> {
     let settings = config.composer_settings();
     let (epsilon, rate) = (config.adam_epsilon as f32, config.learning_rate as f32);
+    let told = config.method.imagination() && config.imagination.told;
+    let inputs = if told { TOLD_INPUTS } else { config.inputs };
     let shape = Shape {
-        inputs: config.inputs,
+        inputs,
         memory: config.memory,
         distance_bias: config.distance_bias,
         ..Shape::paper(config.method.attention(), ACTIONS)
@@ -254,8 +285,9 @@ pub fn new(config: &TrainConfig, make: MakeEnvironment) -> Result<OnPolicy<Netwo
         let imagination = &config.imagination;
         // It never leaves the training, where nobody has to talk. What is imagined earns a tenth of a unit: a critic that
         // starts with numbers of size 1 would take long to get there.
-        let shape = Shape { inputs: config.inputs, ..Shape::paper(imagination.attention, DISPLACEMENT) };
-        let networks = Networks::new(shape, config.gradient);
+        let shape = Shape { inputs, ..Shape::paper(imagination.attention, DISPLACEMENT) };
+        // What it says itself is nothing to look at.
+        let networks = Networks::new(shape, config.gradient).seeing(config.inputs);
         CompanionLearner {
             learner: networks.learner(seed, imagination.sigma as f32, 0.01, epsilon, rate),
             rules: Box::new(Imagination(imagination.clone())),

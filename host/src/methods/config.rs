@@ -212,6 +212,9 @@ impl TrainConfig {
         if self.inputs != BASE && self.inputs != SIZE {
             bail!("inputs is {}; it must be {BASE}, the paper's protocol, or {SIZE}", self.inputs);
         }
+        if self.imagination.told && self.method.imagination() && self.inputs != BASE {
+            bail!("inputs is {}; with imagination.told it must be {BASE}", self.inputs);
+        }
         if self.memory != 0 && self.memory != MEMORY {
             bail!("memory is {}; it must be 0 or {MEMORY}", self.memory);
         }
@@ -251,6 +254,7 @@ mod tests {
             ("kl_target = 0.01\nlearning_rate = 0.1", "learning_rate is 0.1; with a kl_target it must be from 0.00001"),
             ("sigma_min = 0.5", "sigma_min is 0.5; it must not be above sigma, 0.45"),
             ("sigma = 0.8\nsigma_min = 0.5", "sigma_min is 0.5; it must not be above imagination.sigma, 0.45"),
+            ("inputs = 48\nimagination.told = true", "inputs is 48; with imagination.told it must be 40"),
         ] {
             let config: TrainConfig = toml::from_str(text).unwrap();
             let error = config.validate().unwrap_err().to_string();

@@ -26,6 +26,7 @@
 //! A dead module neither imagines (it stays where it is) nor is asked to follow.
 
 use anyhow::{Result, bail};
+use composer_shared::observation::{BASE, Observation};
 use serde::{Deserialize, Serialize};
 
 use super::on_policy::Companion;
@@ -68,6 +69,8 @@ pub struct ImaginationConfig {
     pub feasible: f64,
     /// Its actor attends to other modules, too.
     pub attention: bool,
+    /// The control policy is told what it imagines now: its mean displacement as a share of the bound, three more inputs. No module runs such a policy.
+    pub told: bool,
 }
 
 impl Default for ImaginationConfig {
@@ -85,6 +88,7 @@ impl Default for ImaginationConfig {
             own_targets: false,
             feasible: 0.0,
             attention: false,
+            told: false,
         }
     }
 }
@@ -171,6 +175,14 @@ impl Companion for Imagination {
         self.0.each
     }
 
+    fn tells(&self) -> bool {
+        self.0.told
+    }
+
+    fn tell(&self, means: &[f32], observations: &mut [Observation]) {
+        tell(means, observations);
+    }
+
     fn feasible(&self) -> f32 {
         self.0.feasible as f32
     }
@@ -184,6 +196,16 @@ impl Companion for Imagination {
             if *acts { distance(environment.place(module, [0.0; 3]), *target) } else { 0.0 }
         };
         plan.iter().zip(acts).enumerate().map(of).collect()
+    }
+}
+
+/// Numbers of an observation that a control policy takes which is told what is imagined.
+pub const TOLD_INPUTS: usize = BASE + DISPLACEMENT;
+
+/// Puts the imagination policy's mean actions, `[module][DISPLACEMENT]`, behind the paper's fields of the observations, as displacements with a bound of 1.
+pub fn tell(means: &[f32], observations: &mut [Observation]) {
+    for (observation, u) in observations.iter_mut().zip(means.as_chunks::<DISPLACEMENT>().0) {
+        observation[BASE..TOLD_INPUTS].copy_from_slice(&displacement(*u, 1.0));
     }
 }
 

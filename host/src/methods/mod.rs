@@ -36,6 +36,7 @@ use serde::{Deserialize, Serialize};
 pub use self::baselines::SavedWeights;
 pub use self::composer::Differentiation;
 use self::composer::float::FloatPolicy;
+use self::composer::told::{ToldNetworks, ToldPolicy};
 pub use self::config::TrainConfig;
 use self::ranks::Ranks;
 use crate::environment::{Environment, Outcome};
@@ -223,6 +224,8 @@ pub fn create(config: &TrainConfig, make: MakeEnvironment) -> Result<Box<dyn Alg
 pub enum TrainedPolicy {
     /// The network of COMPOSER or one of its ablations, which can be frozen.
     Composer(Box<Network>),
+    /// Those of COMPOSER where the control policy is told what is imagined, which cannot.
+    Told(Box<ToldNetworks>),
     /// That of a baseline, which cannot.
     Weights(SavedWeights),
 }
@@ -236,6 +239,9 @@ impl TrainedPolicy {
     pub fn network(&self) -> Result<&Network> {
         match self {
             TrainedPolicy::Composer(network) => Ok(network),
+            TrainedPolicy::Told(_) => {
+                bail!("with imagination.told it needs the imagination policy, too, for which the image has no room")
+            }
             TrainedPolicy::Weights(saved) => bail!("{}", saved.method.why_not_frozen()),
         }
     }
@@ -256,6 +262,7 @@ impl TrainedPolicy {
     pub fn check(&self) -> Result<()> {
         match self {
             TrainedPolicy::Composer(network) => Ok(network.check()?),
+            TrainedPolicy::Told(networks) => networks.check(),
             TrainedPolicy::Weights(saved) => saved.check(),
         }
     }
@@ -264,6 +271,7 @@ impl TrainedPolicy {
     pub fn policy(&self) -> Box<dyn Policy + '_> {
         match self {
             TrainedPolicy::Composer(network) => Box::new(FloatPolicy::new(network)),
+            TrainedPolicy::Told(networks) => Box::new(ToldPolicy::new(networks)),
             TrainedPolicy::Weights(saved) => saved.policy(),
         }
     }

@@ -361,10 +361,13 @@ mod tests {
 
     #[test]
     fn six_iterations_are_three_and_a_resumption_and_three() {
-        for method in Method::COMPOSERS {
+        for (method, told) in
+            Method::COMPOSERS.map(|method| (method, false)).into_iter().chain([(Method::Composer, true)])
+        {
             // With a learning rate that falls and with one that is adapted.
             let kl_target = if method.imagination() { 0.01 } else { 0.0 };
-            let config = TrainConfig { total_steps: 6 * 96, kl_target, ..small(method) };
+            let imagination = ImaginationConfig { told, ..Default::default() };
+            let config = TrainConfig { total_steps: 6 * 96, kl_target, imagination, ..small(method) };
             let mut straight = Trainer::new(&config, &teams, "trivial").unwrap();
             let reports: Vec<_> = (0..6).map(|_| straight.iterate().unwrap().scalars).collect();
 

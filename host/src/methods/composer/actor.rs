@@ -18,7 +18,7 @@
 //! team alone, bit for bit: a batch of many teams and a rollout of one agree.
 
 use composer_shared::observation::BASE;
-use composer_shared::policy::{DISTANCE_BUCKETS, OUT, distance_bucket, leak};
+use composer_shared::policy::{DISTANCE_BUCKETS, distance_bucket, leak};
 pub use composer_shared::policy::{EMBED, HIDDEN, KEY, MEMORY, VALUE};
 
 use crate::methods::kernels::{Start, bias_tanh_backward, dense, dense_weights, dot, head, head_backward, tanh};
@@ -59,7 +59,7 @@ impl Shape {
     pub fn of(network: &Network) -> Self {
         Self {
             attention: network.attention,
-            outputs: OUT,
+            outputs: network.output.outputs,
             inputs: network.inputs,
             memory: network.memory,
             distance_bias: network.attention && !network.distance_bias.is_empty(),
@@ -321,6 +321,11 @@ impl Actor {
         let mut actor = Self { layout, parameters: vec![0.0; layout.len], transposed: vec![0.0; layout.len] };
         actor.load(parameters);
         actor
+    }
+
+    /// The network that it is, with the statistics of the observations that it takes.
+    pub fn network(&self, mean: &[f32], std: &[f32]) -> Network {
+        self.layout.network(&self.parameters, mean, std)
     }
 
     /// The parameters, in the order of the layout.

@@ -93,6 +93,15 @@ impl FloatPolicy {
         }
     }
 
+    /// What its outputs are for one robot, unclipped, `[module][outputs]`, without a memory.
+    pub fn means(&self, view: &View) -> Vec<f32> {
+        let heard: Vec<u64> = with_itself(&view.heard).collect();
+        let (n, mut scratch) = (heard.len(), ActorScratch::default());
+        self.pass(&mut vec![[0.0; MEMORY]; n], &view.observations, &heard, &[n], &mut scratch);
+        scratch.means.truncate(n * self.actor.layout().outputs());
+        scratch.means
+    }
+
     /// Query, key and value of every module, side by side, a step after these memories; nothing without attention.
     pub fn latents(&self, memories: &mut [[f32; MEMORY]], observations: &[Observation]) -> Vec<[f32; LATENT]> {
         if !self.attention {

@@ -20,6 +20,7 @@ use crate::methods::random::stream;
 use crate::methods::workers::Workers;
 use crate::methods::{Algorithm, config::TrainConfig, imagination::ImaginationConfig};
 use crate::network::Network;
+use crate::policy::Memories;
 
 type Learner = super::Learner<Networks>;
 
@@ -619,4 +620,66 @@ fn the_imagination_points_at_the_target_and_the_control_policy_follows() {
         }
     }
     assert!(apart > 1.5, "{apart}");
+}
+
+#[test]
+fn the_control_policy_is_told_what_is_imagined_and_the_imagination_does_not_look_at_it() {
+    let config = TrainConfig {
+        method: Method::Composer,
+        environments: 3,
+        rollout_steps: 20,
+        learning_rate: 1e-3,
+        imagination: ImaginationConfig { told: true, attention: true, ..Default::default() },
+        ..Default::default()
+    };
+    let mut trainer = new(&config, &|index| {
+        let team = Trivial::new(3 + index, Told::Head);
+        Ok(Box::new(if index == 2 { team.with_dead(1) } else { team }))
+    })
+    .unwrap();
+    for _ in 0..4 {
+        let report = trainer.iterate().unwrap();
+        // What was told in the rollout is what the update sees, of both.
+        for name in ["losses/first_minibatch_kl", "imagination/first_minibatch_kl"] {
+            assert!(report.get(name).abs() < 1e-6, "{name}: {}", report.get(name));
+        }
+    }
+    let policy = trainer.policy();
+    policy.check().unwrap();
+    let TrainedPolicy::Told(networks) = &policy else { panic!("{policy:?}") };
+    let told = |network: &Network| -> Vec<f32> {
+        network.encoder.weights.chunks_exact(TOLD_INPUTS).flat_map(|row| row[BASE..].to_vec()).collect()
+    };
+    assert!(told(&networks.imagination).iter().all(|w| *w == 0.0));
+    assert!(told(&networks.control).iter().all(|w| *w != 0.0));
+    // It was told something, never more than the bound.
+    let [mean, std] = [&networks.control.mean, &networks.control.std].map(|numbers| &numbers[BASE..]);
+    assert!(mean.iter().any(|m| m.abs() > 1e-3) && mean.iter().zip(std).all(|(m, s)| m.abs() < 1.0 && *s <= 1.0));
+
+    let text = serde_json::to_string(&policy).unwrap();
+    assert_eq!(serde_json::from_str::<TrainedPolicy>(&text).unwrap(), policy);
+    assert!(policy.runs_on_modules().unwrap_err().to_string().contains("needs the imagination policy, too"));
+
+    let act = |policy: &TrainedPolicy| {
+        let (mut team, mut view, mut actions) = (Trivial::new(4, Told::Head), View::default(), Vec::new());
+        team.reset(3);
+        team.view(&mut view);
+        policy.policy().act(&view, 0, &mut Memories::default(), &mut actions, None);
+        actions
+    };
+    let mut other = networks.clone();
+    other.imagination.output.bias[0] += 1.0;
+    assert_ne!(act(&policy), act(&TrainedPolicy::Told(other.clone())));
+    // What it imagines is all that it is told.
+    for row in other.control.encoder.weights.chunks_exact_mut(TOLD_INPUTS) {
+        row[BASE..].fill(0.0);
+    }
+    let mut same = other.clone();
+    same.imagination.output.bias[0] -= 1.0;
+    assert_eq!(act(&TrainedPolicy::Told(other.clone())), act(&TrainedPolicy::Told(same)));
+    other.imagination.inputs = BASE;
+    assert_eq!(
+        other.check().unwrap_err().to_string(),
+        "a network takes 40 fields of the observation, 43 were expected"
+    );
 }

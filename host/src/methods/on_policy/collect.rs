@@ -5,11 +5,12 @@
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
+use composer_shared::observation::Observation;
 use rand_chacha::ChaCha8Rng;
 
 use super::buffer::{Decisions, RolloutBuffer, Trajectory};
 use super::{ActorCritic, Drawn, Teams};
-use crate::environment::{Environment, Lesson, PRIVILEGED, View};
+use crate::environment::{Environment, Lesson, PRIVILEGED, View, with_itself};
 use crate::methods::normalise::{Frozen, Running};
 use crate::methods::random::{Stream, derive_seed, normal_noise, stream};
 use crate::methods::ranks::{self, Opened, Parcel, Ranks};
@@ -147,6 +148,16 @@ pub trait Companion: Send + Sync {
     /// Whether every module pays for its own error alone.
     fn each(&self) -> bool {
         false
+    }
+
+    /// Whether the control policy is told what it would do.
+    fn tells(&self) -> bool {
+        false
+    }
+
+    /// Tells it: puts the mean actions, `[module][outputs]`, where the control policy takes them from.
+    fn tell(&self, means: &[f32], observations: &mut [Observation]) {
+        let _ = (means, observations);
     }
 
     /// What is taken off its own reward for the error that is left when a plan ends.
@@ -364,6 +375,7 @@ fn run<C: ActorCritic>(
         exchange.observations.clear();
         exchange.heard.clear();
         for (worker, trajectory) in group.iter_mut().zip(&mut *trajectories) {
+            tell(&mut worker.view, iteration, scratch);
             let first = trajectory.observations.len();
             for module in 0..worker.modules {
                 worker.observations.push(&worker.view.observations[module]);
@@ -458,6 +470,7 @@ fn run<C: ActorCritic>(
             if outcome.terminated || truncated {
                 if truncated {
                     worker.environment.view(&mut worker.view);
+                    tell(&mut worker.view, iteration, scratch);
                     finals(trajectory, &worker.view, iteration);
                 }
                 worker.episode += 1;
@@ -475,6 +488,7 @@ fn run<C: ActorCritic>(
             trajectory.terminated.push(outcome.terminated);
             trajectory.truncated.push(truncated);
             if last && !truncated {
+                tell(&mut worker.view, iteration, scratch);
                 finals(trajectory, &worker.view, iteration);
             }
         }
@@ -497,6 +511,19 @@ fn run<C: ActorCritic>(
         endings.clear();
     }
     physics
+}
+
+/// Tells the control policy what the companion would do, if it is one that tells.
+fn tell<C: ActorCritic>(view: &mut View, iteration: &Iteration<C>, scratch: &mut C::Scratch) {
+    let Some((policy, _, rules)) = iteration.companion.filter(|(_, _, rules)| rules.tells()) else { return };
+    let mut normalised = Vec::new();
+    view.observations.iter().for_each(|observation| iteration.observations.apply(observation, &mut normalised));
+    let heard: Vec<u64> = with_itself(&view.heard).collect();
+    let modules = [heard.len()];
+    let teams = Teams { observations: &normalised, privileged: &[], heard: &heard, modules: &modules };
+    let (mut means, noise) = (Vec::new(), vec![0.0; heard.len() * policy.outputs()]);
+    policy.sample(teams, &noise, scratch, &mut means, &mut Vec::new());
+    rules.tell(&means, &mut view.observations);
 }
 
 /// Appends a final view to a trajectory.

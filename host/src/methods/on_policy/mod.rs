@@ -233,6 +233,12 @@ pub trait ActorCritic: Send + Sync + 'static {
 
     /// The policy as it is, with the statistics of its observations: what evaluation runs.
     fn policy(&self, mean: &[f32], std: &[f32]) -> TrainedPolicy;
+
+    /// The same where it is told what the policy beside it would do.
+    fn told_policy(&self, companion: &Self, mean: &[f32], std: &[f32]) -> TrainedPolicy {
+        let _ = companion;
+        self.policy(mean, std)
+    }
 }
 
 /// A second policy that learns beside the control policy, from the same rollouts.
@@ -423,7 +429,11 @@ impl<C: ActorCritic> Algorithm for OnPolicy<C> {
     }
 
     fn policy(&self) -> TrainedPolicy {
-        self.control.networks.policy(&self.observations.mean(), &self.observations.std())
+        let (mean, std) = (self.observations.mean(), self.observations.std());
+        match self.companion.as_ref().filter(|companion| companion.rules.tells()) {
+            Some(companion) => self.control.networks.told_policy(&companion.learner.networks, &mean, &std),
+            None => self.control.networks.policy(&mean, &std),
+        }
     }
 
     fn iteration(&self) -> u64 {
