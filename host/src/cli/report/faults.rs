@@ -59,7 +59,7 @@ pub struct Arguments {
     #[arg(long, default_value_t = 500_000)]
     specialist_steps: u64,
     /// Folder of the settings, TASK.toml, from which a specialist takes the learner's
-    #[arg(long, value_name = "DIR", default_value = "host/configs/robust")]
+    #[arg(long, value_name = "DIR", default_value = "host/configs")]
     configs: PathBuf,
     /// Folder of finished runs, TASK: each specialist begins with the policy of the one of its task [default: from nothing]
     #[arg(long, value_name = "DIR")]
@@ -340,7 +340,7 @@ mod tests {
     #[test]
     fn a_specialist_is_trained_for_what_is_not_mastered_and_only_once() {
         let folder = tempfile::tempdir().unwrap();
-        let configs = concat!(env!("CARGO_MANIFEST_DIR"), "/configs/robust");
+        let configs = concat!(env!("CARGO_MANIFEST_DIR"), "/configs");
         let line = |mastered: &str| {
             let set = ["environments=4", "rollout_steps=32", "minibatches=2", "epochs=1", "critic_epochs=1"];
             let set = set.map(|setting| format!("--set={setting}"));

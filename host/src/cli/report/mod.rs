@@ -22,7 +22,7 @@ pub struct Arguments {
 enum Which {
     /// The paper's comparison: COMPOSER, its ablations and five baselines on all five tasks.
     Paper(paper::Arguments),
-    /// The policies that ship: trained with several seeds, frozen, measured; the one of the median success goes to shared/policies.
+    /// The policies that ship: trained with several seeds, frozen, measured; the one of the median success over all rows goes to shared/policies.
     Policies(policies::Arguments),
     /// The physics alone: open-loop experiments over steps, tolerances and solvers, against a far finer reference.
     Physics(physics::Arguments),

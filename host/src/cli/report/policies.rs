@@ -1,4 +1,4 @@
-//! `snakectl report policies`: every policy that ships, from nothing. Each task is trained with several seeds; the policy of the median success ships,
+//! `snakectl report policies`: every policy that ships, from nothing. Each task is trained with several seeds; the policy of the median success over all rows on the robot's own length ships,
 //! and its manifest says what the others can do.
 
 use std::fmt::Write as _;
@@ -81,8 +81,8 @@ struct Done<'a> {
 }
 
 impl Done<'_> {
-    fn healthy(&self) -> f64 {
-        self.measured.first().map_or(0.0, |row| row.success_rate)
+    fn overall(&self) -> f64 {
+        overall(&self.measured)
     }
 
     fn seed(&self) -> u64 {
@@ -196,6 +196,14 @@ pub(super) fn world(env: &crate::env::EnvConfig) -> u32 {
     CRC_32.checksum(text.as_bytes())
 }
 
+/// Mean success over the rows on the robot's own length, whole and broken, nominal and varied. The healthy row alone would choose by chance among seeds
+/// that nearly always succeed.
+fn overall(measured: &[Measured]) -> f64 {
+    let own = measured.first().map_or(0, |row| row.modules);
+    let rows = || measured.iter().filter(|row| row.modules == own);
+    rows().map(|row| row.success_rate).sum::<f64>() / rows().count().max(1) as f64
+}
+
 /// The number of the median success; of an even number the lower one, of equals the earlier seed.
 fn median(success: &[f64]) -> usize {
     let mut order: Vec<usize> = (0..success.len()).collect();
@@ -209,9 +217,9 @@ struct Shipped<'a> {
     chosen: usize,
 }
 
-/// Writes the policy of the median success.
+/// Writes the policy of the median success ([`overall`]).
 fn ship<'a>(seeds: Vec<Done<'a>>, to: &Path) -> Result<Shipped<'a>> {
-    let chosen = median(&seeds.iter().map(Done::healthy).collect::<Vec<_>>());
+    let chosen = median(&seeds.iter().map(Done::overall).collect::<Vec<_>>());
     let rows = seeds.iter().map(|done| SeedRows { seed: done.seed(), measured: done.measured.clone() }).collect();
     let done = &seeds[chosen];
     let folder = &done.run.folder;
@@ -289,8 +297,9 @@ fn tables(shipped: &[Shipped]) -> Result<String> {
     let line = |cell: &dyn Fn(&Done) -> String| chosen.iter().map(|done| cell(done)).collect::<Vec<_>>().join(" | ");
     let Some(first) = chosen.first() else { bail!("there is no policy to publish") };
     let episodes = first.measured.first().map_or(0, |row| row.episodes);
-    let mut table =
-        format!("{episodes} episodes a row, 95 % interval (Wilson); the seed of the median success ships.\n\n");
+    let mut table = format!(
+        "{episodes} episodes a row, 95 % interval (Wilson); the seed of the median success over all rows with the robot's own modules ships.\n\n"
+    );
     writeln!(table, "| | {} |\n|---|{}", line(&|done| done.run.task.title().into()), "---|".repeat(chosen.len()))?;
     // A task may have a row that the others do not have.
     let mut names: Vec<(String, usize)> = Vec::new();
@@ -349,6 +358,8 @@ mod tests {
 
     #[test]
     fn the_median_ships() {
+        let row = |modules, success_rate| Measured { modules, success_rate, ..Measured::default() };
+        assert_eq!(overall(&[row(8, 1.0), row(8, 0.5), row(16, 0.0)]), 0.75);
         assert_eq!(median(&[0.9, 0.2, 0.5]), 2);
         assert_eq!(median(&[0.9, 0.2]), 1);
         assert_eq!((median(&[0.7]), median(&[0.5, 0.5, 0.5])), (0, 1));
