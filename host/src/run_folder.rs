@@ -128,6 +128,11 @@ fn fingerprint(config: &RunConfig) -> String {
             }
         }
     }
+    // The learner's settings are here by their defaults alone, and those of before had no such one.
+    let imagination = world.get_mut("train").and_then(|train| train.get_mut("imagination"));
+    if let Some(imagination) = imagination.and_then(toml::Value::as_table_mut) {
+        imagination.remove("told");
+    }
     let digest = CRC_32.checksum(toml::to_string(&world).unwrap_or_default().as_bytes());
     format!(
         "{} on {} with {} modules, settings {digest:08x}",
