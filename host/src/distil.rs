@@ -22,9 +22,9 @@ use crate::network::Network;
 use crate::policy::{Memories, Policy};
 
 /// Rounds of episodes.
-const ROUNDS: usize = 4;
+const ROUNDS: usize = 8;
 /// Updates after each round.
-pub const UPDATES: usize = 3000;
+pub const UPDATES: usize = 4000;
 /// Samples of an update.
 const BATCH: usize = 512;
 /// Learning rate at the start; it falls to 0 over all updates.

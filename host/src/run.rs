@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::env::{EnvConfig, FaultTraining, knows_fault};
 use crate::methods::TrainConfig;
+use crate::methods::curriculum::{CurriculumConfig, Pretraining, SecondStage};
 use crate::robot::Robot;
 use crate::tasks::block_pushing::BlockPushing;
 use crate::tasks::goal_reaching::GoalReaching;
@@ -159,6 +160,9 @@ impl RunConfig {
     /// Says what is wrong with the settings, if anything is.
     pub fn validate(&self) -> Result<()> {
         self.train.validate()?;
+        if let Some(before) = self.pretraining() {
+            before.validate().context("the pretraining")?;
+        }
         self.robot.validate()?;
         let substeps = self.env.control_period / self.robot.physics_step;
         if !(1.0..=100.0).contains(&substeps) || (substeps - substeps.round()).abs() > 1e-3 {
@@ -201,6 +205,29 @@ impl RunConfig {
             bail!("faults.weights = {:?}; they must be zero or more, one of them above zero", faults.weights);
         }
         Ok(())
+    }
+
+    /// The run that comes before this one, if one does (`[train.pretraining]`): by the paper's protocol.
+    pub fn pretraining(&self) -> Option<RunConfig> {
+        let Pretraining { steps, learning_rate, sigma } = self.train.pretraining;
+        let train = TrainConfig {
+            total_steps: steps,
+            learning_rate,
+            sigma,
+            pretraining: Pretraining::default(),
+            curriculum: CurriculumConfig::default(),
+            second: SecondStage::default(),
+            ..self.train.clone()
+        };
+        let env = EnvSettings { lengths: Vec::new(), ..self.env.clone() };
+        let task = TaskSettings { rearing_penalty: 0.0, ..self.task.clone() };
+        let (faults, vary) = (FaultTraining::default(), Variation::default());
+        (steps > 0).then(|| RunConfig { train, env, task, faults, vary, ..self.clone() })
+    }
+
+    /// Environment steps of the run and of the one before it.
+    pub fn environment_steps(&self) -> u64 {
+        self.train.total_steps + self.train.pretraining.steps
     }
 
     /// The environment that training number `index` works in.

@@ -14,7 +14,8 @@ use crate::env::{FaultTraining, SnakeEnv};
 use crate::eval::{Trial, curve_seed, healthy};
 use crate::files::{create_folder, write_whole};
 use crate::freeze::{Parity, freeze, parity};
-use crate::methods::TrainedPolicy;
+use crate::methods::curriculum::Pretraining;
+use crate::methods::{TrainConfig, TrainedPolicy};
 use crate::outcome::Report;
 use crate::run::RunConfig;
 use crate::train::{Beside, TrainSummary, checkpoint, follow, metrics as log, train};
@@ -29,6 +30,8 @@ pub const CALIBRATION_EPISODES: u64 = 24;
 
 /// Settings of a run, in its folder.
 pub const CONFIG_FILE: &str = "config.toml";
+/// Folder of the run before a run, in its folder.
+pub const PRETRAINING_FOLDER: &str = "pretraining";
 /// Policy of a run as of its last evaluation, in its folder.
 pub const NETWORK_FILE: &str = "network.json";
 
@@ -53,12 +56,19 @@ pub fn load_run(folder: &Path) -> Result<(RunConfig, TrainedPolicy)> {
     Ok((config, policy))
 }
 
-/// Starts a run in the folder `out`, or goes on with the one that is there. Judges the policy every so often, healthy and (if it trains with
-/// faults) faulty, and keeps the policy of the last judgement. None: the run is that of another rank, which this one only helped.
+/// Starts a run in the folder `out`, or goes on with the one that is there; the one before it, if it has one, is in a folder of its own in there. Judges
+/// the policy every so often, healthy and (if it trains with faults) faulty, and keeps the policy of the last judgement. None: the run is that of
+/// another rank, which this one only helped.
 pub fn train_in(config: &RunConfig, out: &Path, resuming: bool, beside: &Beside) -> Result<Option<TrainSummary>> {
     let make = |index: usize| -> Result<Box<dyn crate::environment::Environment>> {
         Ok(Box::new(SnakeEnv::new(config.environment(index)?)))
     };
+    if beside.ranks.is_some() && config.train.pretraining.steps > 0 {
+        bail!(
+            "pretraining.steps is {}; a run over several processes begins from nothing or with train.start: it must be 0",
+            config.train.pretraining.steps
+        );
+    }
     if beside.follows() {
         follow(&config.train, &make, &fingerprint(config), out, resuming, beside)?;
         return Ok(None);
@@ -69,6 +79,21 @@ pub fn train_in(config: &RunConfig, out: &Path, resuming: bool, beside: &Beside)
             bail!("{} already holds a run: go on with --resume {0}, or choose another --out", out.display());
         }
         write_whole(&out.join(CONFIG_FILE), toml::to_string(config)?.as_bytes())?;
+    }
+    let mut learner = config.train.clone();
+    let mut resuming = resuming;
+    if let Some(before) = config.pretraining() {
+        let folder = out.join(PRETRAINING_FOLDER);
+        learner = TrainConfig { start: folder.display().to_string(), pretraining: Pretraining::default(), ..learner };
+        resuming &= out.join(checkpoint::FILE).exists();
+        if !resuming {
+            let name = beside.name.map_or_else(String::new, |name| format!("{name}/")) + PRETRAINING_FOLDER;
+            let beside = Beside { name: Some(&name), ranks: None };
+            let summary = train_in(&before, &folder, can_go_on(&folder, &before)?, &beside)?;
+            if summary.as_ref().is_none_or(|summary| summary.interrupted) {
+                return Ok(summary);
+            }
+        }
     }
     let evaluation = Arc::new(config.evaluation());
     let faulty = |seed, modules| config.faults.draw(seed, modules);
@@ -91,7 +116,7 @@ pub fn train_in(config: &RunConfig, out: &Path, resuming: bool, beside: &Beside)
         let _ = save_policy(out, policy);
         scalars
     };
-    let summary = train(&config.train, &make, &fingerprint(config), out, resuming, beside, &mut evaluate)?;
+    let summary = train(&learner, &make, &fingerprint(config), out, resuming, beside, &mut evaluate)?;
     save_policy(out, &summary.policy)?;
     Ok(Some(summary))
 }
@@ -128,10 +153,13 @@ fn fingerprint(config: &RunConfig) -> String {
             }
         }
     }
-    // The learner's settings are here by their defaults alone, and those of before had no such one.
+    // The learner's settings are here by their defaults alone, and those of before had not these.
     let imagination = world.get_mut("train").and_then(|train| train.get_mut("imagination"));
     if let Some(imagination) = imagination.and_then(toml::Value::as_table_mut) {
         imagination.remove("told");
+    }
+    if let Some(train) = world.get_mut("train").and_then(toml::Value::as_table_mut) {
+        train.remove("pretraining");
     }
     let digest = CRC_32.checksum(toml::to_string(&world).unwrap_or_default().as_bytes());
     format!(
@@ -154,6 +182,17 @@ pub fn begun(folder: &Path, config: &RunConfig) -> Result<bool> {
     Ok(true)
 }
 
+/// Refuses a folder that holds a run with other settings; whether there is one with these that has a checkpoint. What was killed before it had one is not
+/// there afterwards.
+fn can_go_on(folder: &Path, config: &RunConfig) -> Result<bool> {
+    let begun = begun(folder, config)?;
+    let saved = folder.join(checkpoint::FILE).exists();
+    if begun && !saved {
+        std::fs::remove_file(folder.join(CONFIG_FILE))?;
+    }
+    Ok(begun && saved)
+}
+
 /// Trains a run on `threads` threads, or goes on with it. False: interrupted, the next time it goes on from there.
 ///
 /// A process at a time: another that wants the same run waits.
@@ -161,12 +200,7 @@ pub fn trained(folder: &Path, config: &RunConfig, threads: usize) -> Result<bool
     let mut config = config.clone();
     config.train.threads = threads;
     let _alone = alone(folder)?;
-    let mut begun = begun(folder, &config)?;
-    if begun && !folder.join(checkpoint::FILE).exists() {
-        // Killed before anything was computed.
-        std::fs::remove_file(folder.join(CONFIG_FILE))?;
-        begun = false;
-    }
+    let begun = can_go_on(folder, &config)?;
     let name = folder.file_name().unwrap_or_default().to_string_lossy();
     let beside = Beside { name: Some(&name), ranks: None };
     Ok(train_in(&config, folder, begun, &beside)?.is_some_and(|summary| !summary.interrupted))
@@ -226,20 +260,92 @@ pub fn metrics(folder: &Path) -> Result<Vec<Value>> {
         .collect()
 }
 
-/// Wall time that a run has taken by its metrics, s; 0 without any. Each time that it was resumed they count from 0 again.
+/// The lines of the metrics of a run, those of the one before it first, if there was one.
+pub fn metrics_with_pretraining(folder: &Path) -> Result<String> {
+    let read = |folder: &Path| {
+        let path = folder.join(log::FILE);
+        std::fs::read_to_string(&path).with_context(|| format!("cannot read the metrics {}", path.display()))
+    };
+    let before = folder.join(PRETRAINING_FOLDER);
+    let before = if before.exists() { read(&before)? } else { String::new() };
+    Ok(before + &read(folder)?)
+}
+
+/// Wall time that a run and the one before it have taken by their metrics, s; 0 without any. Each time that it was resumed they count from 0 again.
 pub fn wall_seconds(run: &Path) -> f64 {
+    let before_it = run.join(PRETRAINING_FOLDER);
+    let before_it = if before_it.exists() { wall_seconds(&before_it) } else { 0.0 };
     let lines = metrics(run).unwrap_or_default();
     let readings = lines.iter().filter_map(|line| line["time/wall_seconds"].as_f64());
     let (before, last) = readings.fold((0.0, 0.0), |(before, last), now| match now < last {
         true => (before + last, now),
         false => (before, now),
     });
-    before + last
+    before_it + before + last
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// What is pretrained is a run by itself on the robot as it should be, the run begins with its policy, and stopped after either it goes on as if it
+    /// had not been.
+    #[test]
+    fn a_run_begins_with_what_was_pretrained() {
+        let mut config = RunConfig::default();
+        for setting in [
+            "environments=2",
+            "rollout_steps=16",
+            "minibatches=1",
+            "total_steps=64",
+            "sigma=0.2",
+            "evaluation_episodes=1",
+            "checkpoint_seconds=0.0",
+            "pretraining.steps=32",
+            "pretraining.sigma=0.4",
+            "faults.probability=0.5",
+            "env.lengths=[8, 9]",
+            "curriculum.varied=0.5",
+        ] {
+            config.set(setting).unwrap();
+        }
+        config.vary = toml::from_str("slope = [0.0, 4.0]").unwrap();
+        config.validate().unwrap();
+        let before = config.pretraining().unwrap();
+        assert_eq!((before.train.total_steps, before.train.sigma), (32, 0.4));
+        assert!(before.pretraining().is_none());
+        assert_eq!((&before.faults, &before.vary), (&FaultTraining::default(), &Default::default()));
+        assert!(before.env.lengths.is_empty());
+
+        let (a, b, alone) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        let run = |config: &RunConfig, folder: &Path, resuming| {
+            train_in(config, folder, resuming, &Beside::default()).unwrap().unwrap().policy
+        };
+        let whole = run(&config, a.path(), false);
+        let pretrained = run(&before, alone.path(), false);
+        assert_eq!(load_run(&a.path().join(PRETRAINING_FOLDER)).unwrap(), (before.clone(), pretrained));
+        // It matters what it began with.
+        let mut otherwise = config.clone();
+        otherwise.train.pretraining.learning_rate = 1e-5;
+        let c = tempfile::tempdir().unwrap();
+        assert_ne!(run(&otherwise, c.path(), false), whole);
+
+        // Stopped between the two.
+        write_whole(&b.path().join(CONFIG_FILE), toml::to_string(&config).unwrap().as_bytes()).unwrap();
+        run(&before, &b.path().join(PRETRAINING_FOLDER), false);
+        assert_eq!(run(&config, b.path(), true), whole);
+        // In another place, with a step more.
+        let moved = tempfile::tempdir().unwrap();
+        let moved = moved.path().join("moved");
+        std::fs::rename(b.path(), &moved).unwrap();
+        assert_eq!(run(&config, &moved, true), whole);
+        assert_eq!(metrics_with_pretraining(&moved).unwrap().lines().count(), 1 + 2);
+        // Other settings of the pretraining are not those that it had.
+        otherwise.train.total_steps = 32;
+        std::fs::remove_file(moved.join(checkpoint::FILE)).unwrap();
+        let error = train_in(&otherwise, &moved, true, &Beside::default()).err().unwrap().to_string();
+        assert!(error.contains("pretraining holds a run with other settings"), "{error}");
+    }
 
     #[test]
     fn the_time_before_an_interruption_counts() {

@@ -154,7 +154,16 @@ fn the_policies_that_ship_are_made_from_nothing_and_the_median_of_the_seeds_ship
         let arguments: [&[&str]; 4] = [
             &["report", "policies", "--tasks", "goal-reaching,shape-formation", "--seeds", "3", "--episodes", "2"],
             &["--configs", configs, "--runs", "r", "--out", "o", "--ship", "s", "--set", "total_steps=512"],
-            &["--set", "environments=4", "--set", "rollout_steps=32", "--set", "evaluation_episodes=1"],
+            &[
+                "--set",
+                "environments=4",
+                "--set",
+                "rollout_steps=32",
+                "--set",
+                "evaluation_episodes=1",
+                "--set",
+                "pretraining.steps=128",
+            ],
             more,
         ];
         succeed(folder.path(), &arguments.concat())

@@ -20,6 +20,8 @@ use crate::vary::{self, Variation};
 
 /// Arguments of the demonstration.
 #[derive(clap::Args, Clone, Debug)]
+// `demo` has them beside its own: clap refuses two groups of one name in a build with debug assertions.
+#[group(skip)]
 pub struct Arguments {
     /// Episodes of each row of the table
     #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..=100_000))]

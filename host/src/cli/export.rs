@@ -14,7 +14,7 @@ use crate::files::write_whole;
 use crate::freeze::Parity;
 use crate::outcome::Report;
 use crate::run::RunConfig;
-use crate::run_folder::{CALIBRATION_EPISODES, freeze_run, wall_seconds};
+use crate::run_folder::{CALIBRATION_EPISODES, freeze_run, metrics_with_pretraining, wall_seconds};
 use crate::stats::with_interval;
 use crate::vary::{self, Variation};
 
@@ -233,8 +233,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         .into_iter()
         .map(|row| measure(&env, &image, row, arguments.measured_episodes, threads))
         .collect::<Result<Vec<_>>>()?;
-    let metrics = std::fs::read(arguments.run.join("metrics.jsonl"))
-        .with_context(|| format!("cannot read the metrics of {}", arguments.run.display()))?;
+    let metrics = metrics_with_pretraining(&arguments.run)?;
     for m in &measured {
         println!(
             "{:>2} modules, {:<14} {:<16} success {}, {:.1} steps of at most {}",
@@ -247,7 +246,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         );
     }
     let exported = Exported { config, run: &arguments.run, image: &image, parity, measured, seeds: Vec::new() };
-    exported.write(&arguments.out, &metrics)?;
+    exported.write(&arguments.out, metrics.as_bytes())?;
     let policy = Policy::parse(&image).map_err(|e| anyhow::anyhow!("{e}"))?;
     println!(
         "{}: {} bytes, CRC-32 {:08x}\nfloat against integer actions on {} held-out samples: rms {:.5}, 99 % within {:.5}, max {:.5} of the torque limit",

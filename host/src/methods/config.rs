@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::Method;
 use super::baselines::{MappoConfig, MatConfig, MatDecConfig, PpoConfig};
 use super::composer::Differentiation;
-use super::curriculum::{CurriculumConfig, SecondStage};
+use super::curriculum::{CurriculumConfig, Pretraining, SecondStage};
 use super::imagination::ImaginationConfig;
 use super::on_policy::update::RATE_LIMITS;
 use super::smp::SmpConfig;
@@ -83,6 +83,8 @@ pub struct TrainConfig {
     pub checkpoint_seconds: f64,
     /// Threads; 0 for one per core. The result does not depend on it.
     pub threads: usize,
+    /// A run before the run, on the robot as it should be; for COMPOSER and its ablations.
+    pub pretraining: Pretraining,
     /// What the episodes are like as the run goes on; for the on-policy methods.
     pub curriculum: CurriculumConfig,
     /// A second stage at a constant rate; for the on-policy methods.
@@ -135,6 +137,7 @@ impl Default for TrainConfig {
             checkpoint_seconds: 60.0,
             threads: 0,
             curriculum: CurriculumConfig::default(),
+            pretraining: Pretraining::default(),
             second: SecondStage::default(),
             imagination: ImaginationConfig::default(),
             ppo: PpoConfig::default(),
@@ -224,6 +227,13 @@ impl TrainConfig {
         if self.total_steps == 0 {
             bail!("total_steps is 0; it must be at least 1");
         }
+        self.pretraining.validate()?;
+        if self.pretraining.steps > 0 && !Method::COMPOSERS.contains(&self.method) {
+            bail!("pretraining.steps is {}; {} begins from nothing: it must be 0", self.pretraining.steps, self.method);
+        }
+        if self.pretraining.steps > 0 && !self.start.is_empty() {
+            bail!("a run begins with what was pretrained or with start = {:?}, not with both", self.start);
+        }
         self.curriculum.validate()?;
         self.second.validate()?;
         self.imagination.validate()?;
@@ -254,6 +264,14 @@ mod tests {
             ("kl_target = 0.01\nlearning_rate = 0.1", "learning_rate is 0.1; with a kl_target it must be from 0.00001"),
             ("sigma_min = 0.5", "sigma_min is 0.5; it must not be above sigma, 0.45"),
             ("sigma = 0.8\nsigma_min = 0.5", "sigma_min is 0.5; it must not be above imagination.sigma, 0.45"),
+            (
+                "method = \"mappo\"\npretraining.steps = 9",
+                "pretraining.steps is 9; mappo begins from nothing: it must be 0",
+            ),
+            (
+                "start = \"a\"\npretraining.steps = 9",
+                "begins with what was pretrained or with start = \"a\", not with both",
+            ),
             ("inputs = 48\nimagination.told = true", "inputs is 48; with imagination.told it must be 40"),
         ] {
             let config: TrainConfig = toml::from_str(text).unwrap();

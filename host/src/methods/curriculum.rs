@@ -54,6 +54,38 @@ impl CurriculumConfig {
     }
 }
 
+/// Settings of a run before the run, by the paper's protocol: the robot as it should be, of its own length, nothing broken, nothing varied, no message lost,
+/// no penalty for rearing up. How the task is done is learnt there, and sooner than among faults; the run itself begins with that policy, a critic of its own
+/// and `sigma`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Pretraining {
+    /// Environment steps; they do not count in `total_steps`. Higher: a better gait to begin with. 0: there is none.
+    pub steps: u64,
+    /// Its learning rate at the start; it falls as that of the run does.
+    pub learning_rate: f64,
+    /// Its standard deviation of the actions at the start, as a fraction of the torque limit.
+    pub sigma: f64,
+}
+
+impl Default for Pretraining {
+    fn default() -> Self {
+        Self { steps: 0, learning_rate: 7e-4, sigma: 0.45 }
+    }
+}
+
+impl Pretraining {
+    /// Says what is wrong with the settings, if anything is.
+    pub fn validate(&self) -> Result<()> {
+        for (key, value) in [("learning_rate", self.learning_rate), ("sigma", self.sigma)] {
+            if !(value.is_finite() && value > 0.0) {
+                bail!("pretraining.{key} is {value}; it must be a number above 0");
+            }
+        }
+        Ok(())
+    }
+}
+
 /// Settings of the second stage of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -294,6 +326,13 @@ mod tests {
             ("varied = 2.0", "second.varied is 2; it must be from 0 to 1"),
         ] {
             let error = toml::from_str::<SecondStage>(text).unwrap().validate().unwrap_err().to_string();
+            assert!(error.contains(complaint), "{error}");
+        }
+        for (text, complaint) in [
+            ("learning_rate = inf", "pretraining.learning_rate is inf; it must be a number above 0"),
+            ("sigma = 0.0", "pretraining.sigma is 0; it must be a number above 0"),
+        ] {
+            let error = toml::from_str::<Pretraining>(text).unwrap().validate().unwrap_err().to_string();
             assert!(error.contains(complaint), "{error}");
         }
     }

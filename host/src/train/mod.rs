@@ -96,6 +96,8 @@ impl Trainer {
         was.evaluation_episodes = config.evaluation_episodes;
         was.checkpoint_seconds = config.checkpoint_seconds;
         was.threads = config.threads;
+        // What it began with is behind it, wherever that lies by now.
+        was.start.clone_from(&config.start);
         if was != *config {
             let (was, is) = (settings_of(&was)?, settings_of(config)?);
             let changed = was.iter().filter(|setting| !is.contains(setting));

@@ -19,7 +19,7 @@ use crate::cli::{PolicySource, task_by_name};
 use crate::env::FaultTraining;
 use crate::eval::{PUBLISHED_SEED, Trial, parallel};
 use crate::files::{create_folder, write_whole};
-use crate::methods::curriculum::{CurriculumConfig, SecondStage};
+use crate::methods::curriculum::{CurriculumConfig, Pretraining, SecondStage};
 use crate::plot::{Heatmap, MapWords, heatmaps};
 use crate::rows::Rows;
 use crate::run::RunConfig;
@@ -170,6 +170,7 @@ fn specialist(task: Task, plan: &FaultPlan, arguments: &Arguments) -> Result<Run
     config.faults = FaultTraining { fixed: plan.to_string(), ..FaultTraining::default() };
     config.vary = Variation::default();
     config.env.lengths = Vec::new();
+    config.train.pretraining = Pretraining::default();
     config.train.curriculum = CurriculumConfig::default();
     config.train.second = SecondStage::default();
     config.train.total_steps = arguments.specialist_steps;

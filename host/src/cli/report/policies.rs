@@ -17,7 +17,8 @@ use crate::freeze::Parity;
 use crate::rows::Rows;
 use crate::run::RunConfig;
 use crate::run_folder::{
-    CALIBRATION_EPISODES, CONFIG_FILE, NETWORK_FILE, begun, freeze_run, load_config, trained, wall_seconds,
+    CALIBRATION_EPISODES, CONFIG_FILE, NETWORK_FILE, begun, freeze_run, load_config, metrics_with_pretraining, trained,
+    wall_seconds,
 };
 use crate::side_by_side::side_by_side;
 use crate::stats::with_interval;
@@ -117,7 +118,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         }
     }
     // The longest first, so that none is left to run alone at the end.
-    runs.sort_by_key(|run| std::cmp::Reverse(run.config.train.total_steps));
+    runs.sort_by_key(|run| std::cmp::Reverse(run.config.environment_steps()));
     for folder in [&arguments.runs, &arguments.ship, &arguments.out] {
         create_folder(folder)?;
     }
@@ -223,8 +224,7 @@ fn ship<'a>(seeds: Vec<Done<'a>>, to: &Path) -> Result<Shipped<'a>> {
     let rows = seeds.iter().map(|done| SeedRows { seed: done.seed(), measured: done.measured.clone() }).collect();
     let done = &seeds[chosen];
     let folder = &done.run.folder;
-    let metrics = std::fs::read_to_string(folder.join("metrics.jsonl"))
-        .with_context(|| format!("cannot read the metrics of {}", folder.display()))?;
+    let metrics = metrics_with_pretraining(folder)?;
     let exported = Exported {
         config: done.config.clone(),
         run: folder,
@@ -266,7 +266,7 @@ fn publish(shipped: &[Shipped], out: &Path) -> Result<()> {
         .map(|(ships, done)| {
             json!({
                 "task": done.run.task.name(), "seed": done.seed(), "ships": ships, "crc32": format!("{:08x}", crc(&done.image)),
-                "environment_steps": done.config.train.total_steps, "wall_seconds": wall_seconds(&done.run.folder),
+                "environment_steps": done.config.environment_steps(), "wall_seconds": wall_seconds(&done.run.folder),
                 "parity": done.parity, "measured": done.measured,
             })
         })
@@ -319,7 +319,7 @@ fn tables(shipped: &[Shipped]) -> Result<String> {
         }
     }
     writeln!(table, "| seed that ships | {} |", line(&|done| done.seed().to_string()))?;
-    let million = |done: &Done| format!("{:.1}", done.config.train.total_steps as f64 * 1e-6);
+    let million = |done: &Done| format!("{:.1}", done.config.environment_steps() as f64 * 1e-6);
     writeln!(table, "| trained for, million steps | {} |", line(&million))?;
     writeln!(table, "| in | {} |\n", line(&|done| format!("{:.0} min", wall_seconds(&done.run.folder) / 60.0)))?;
 
