@@ -44,6 +44,8 @@ pub struct BusSettings {
     pub one_port: bool,
     /// Modules that babble get past the guards of their ports: their CAN controllers are broken, not their software.
     pub no_guard: bool,
+    /// A module whose sensors say what cannot be true relaxes, as on a board, instead of acting on zeros.
+    pub blind_relaxes: bool,
 }
 
 impl Default for BusSettings {
@@ -56,6 +58,7 @@ impl Default for BusSettings {
             delay: None,
             one_port: false,
             no_guard: false,
+            blind_relaxes: false,
         }
     }
 }
@@ -222,6 +225,7 @@ impl BusTrial<'_> {
     fn sil_config(&self, seed: u64) -> SilConfig {
         let usual = SilConfig::new(self.bus.kind);
         let mut sil = SilConfig { ring: !self.bus.one_port, guard: !self.bus.no_guard, ..usual };
+        sil.safety.blind_relaxes = self.bus.blind_relaxes;
         if let Some(nominal) = self.bus.bitrate {
             sil.rates = BitRates { nominal, data: sil.rates.data.max(nominal) };
         }

@@ -78,6 +78,9 @@ pub struct Scenario {
     /// Modules that babble get past the guards of their ports.
     #[serde(default)]
     pub no_guard: bool,
+    /// Modules whose sensors say what cannot be true relax, as on a board, instead of acting on zeros.
+    #[serde(default)]
+    pub blind_relaxes: bool,
     /// What the station orders, in order of time.
     #[serde(default)]
     pub command: Vec<Command>,
@@ -389,6 +392,7 @@ impl Ready {
         sil.station_behind = scenario.station_behind;
         sil.ring = !scenario.one_port;
         sil.guard = !scenario.no_guard;
+        sil.safety.blind_relaxes = scenario.blind_relaxes;
         sil.commands.clone_from(&self.commands);
         sil.injected.clone_from(&self.injected);
         let last = scenario.clock.iter().map(|clock| clock.module + 1).max().unwrap_or(0);

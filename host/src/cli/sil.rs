@@ -56,6 +56,10 @@ pub struct BusOptions {
     /// Modules that babble get past the guards of their ports: their CAN controllers are broken, not their software
     #[arg(long)]
     pub no_guard: bool,
+    /// A module whose sensors say what cannot be true relaxes, as a board does unless told otherwise (`blind_acts`); without this it acts on zeros, as the
+    /// paper's does
+    #[arg(long)]
+    pub blind_relaxes: bool,
 }
 
 impl BusOptions {
@@ -70,6 +74,7 @@ impl BusOptions {
             delay: self.delay,
             one_port: self.one_port,
             no_guard: self.no_guard,
+            blind_relaxes: self.blind_relaxes,
         }
     }
 }

@@ -371,7 +371,7 @@ impl Results {
         let text = if bus {
             format!(
                 "The same policies frozen to integers, a complete controller in every module, on a CAN-FD bus that loses {:.0} % of the frames at every \
-                 receiver. A blind module of the bus is blind to its own controller, which relaxes it and says so; in the simulator it acts on zeros.",
+                 receiver. A blind module acts on zeros, there as in the simulator and in the paper, and says so; a board relaxes it unless told otherwise.",
                 100.0 * LOST
             )
         } else {
