@@ -128,7 +128,9 @@ pub fn robust_name(task: Task) -> String {
 /// The environment of the policy of a task that ships, its image and its digest.
 pub fn robust(task: Task) -> Result<(EnvConfig, &'static [u8], String)> {
     let image = policies::shipped(task.name()).context("a policy ships for every task")?;
-    Ok((protocol::settings(task, Method::Composer, 1, None).evaluation(), image, digest(image)))
+    // The checksum over an image and its own checksum is the same for all images.
+    let crc = Image::parse(image).map_err(|e| anyhow::anyhow!("the policy of {task} that ships: {e}"))?.crc();
+    Ok((protocol::settings(task, Method::Composer, 1, None).evaluation(), image, format!("{crc:08x}")))
 }
 
 /// Measures the policy of a task that ships.
@@ -193,4 +195,18 @@ enum Piece {
     Run(Box<Run>),
     /// The policy of a task that ships, to measure.
     Robust(Task),
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    /// What was measured of another policy is not taken for this one's.
+    #[test]
+    fn policies_that_ship_have_digests_of_their_own() {
+        let digests: BTreeSet<String> = Task::ALL.iter().map(|task| robust(*task).unwrap().2).collect();
+        assert_eq!(digests.len(), Task::ALL.len());
+    }
 }
