@@ -220,9 +220,8 @@ impl RunConfig {
             ..self.train.clone()
         };
         let env = EnvSettings { lengths: Vec::new(), ..self.env.clone() };
-        let task = TaskSettings { rearing_penalty: 0.0, ..self.task.clone() };
         let (faults, vary) = (FaultTraining::default(), Variation::default());
-        (steps > 0).then(|| RunConfig { train, env, task, faults, vary, ..self.clone() })
+        (steps > 0).then(|| RunConfig { train, env, faults, vary, ..self.clone() })
     }
 
     /// Environment steps of the run and of the one before it.

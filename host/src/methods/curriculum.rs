@@ -54,9 +54,8 @@ impl CurriculumConfig {
     }
 }
 
-/// Settings of a run before the run, by the paper's protocol: the robot as it should be, of its own length, nothing broken, nothing varied, no message lost,
-/// no penalty for rearing up. How the task is done is learnt there, and sooner than among faults; the run itself begins with that policy, a critic of its own
-/// and `sigma`.
+/// Settings of a run before the run, by the paper's protocol: the robot as it should be, of its own length, nothing broken, nothing varied, no message lost.
+/// How the task is done is learnt there, and sooner than among faults; the run itself begins with that policy, a critic of its own and `sigma`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Pretraining {
