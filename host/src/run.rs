@@ -210,18 +210,22 @@ impl RunConfig {
     /// The run that comes before this one, if one does (`[train.pretraining]`): by the paper's protocol.
     pub fn pretraining(&self) -> Option<RunConfig> {
         let Pretraining { steps, learning_rate, sigma } = self.train.pretraining;
+        (steps > 0).then(|| {
+            let plain = self.plain();
+            RunConfig { train: TrainConfig { total_steps: steps, learning_rate, sigma, ..plain.train }, ..plain }
+        })
+    }
+
+    /// The same in one stage on the robot as it should be: of its own length, nothing broken, nothing varied, no message lost.
+    pub fn plain(&self) -> RunConfig {
         let train = TrainConfig {
-            total_steps: steps,
-            learning_rate,
-            sigma,
             pretraining: Pretraining::default(),
             curriculum: CurriculumConfig::default(),
             second: SecondStage::default(),
             ..self.train.clone()
         };
         let env = EnvSettings { lengths: Vec::new(), ..self.env.clone() };
-        let (faults, vary) = (FaultTraining::default(), Variation::default());
-        (steps > 0).then(|| RunConfig { train, env, faults, vary, ..self.clone() })
+        RunConfig { train, env, faults: FaultTraining::default(), vary: Variation::default(), ..self.clone() }
     }
 
     /// Environment steps of the run and of the one before it.

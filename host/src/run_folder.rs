@@ -154,12 +154,11 @@ fn fingerprint(config: &RunConfig) -> String {
         }
     }
     // The learner's settings are here by their defaults alone, and those of before had not these.
-    let imagination = world.get_mut("train").and_then(|train| train.get_mut("imagination"));
-    if let Some(imagination) = imagination.and_then(toml::Value::as_table_mut) {
-        imagination.remove("told");
-    }
     if let Some(train) = world.get_mut("train").and_then(toml::Value::as_table_mut) {
         train.remove("pretraining");
+        if let Some(imagination) = train.get_mut("imagination").and_then(toml::Value::as_table_mut) {
+            imagination.remove("told");
+        }
     }
     let digest = CRC_32.checksum(toml::to_string(&world).unwrap_or_default().as_bytes());
     format!(
@@ -253,22 +252,24 @@ pub fn freeze_run(folder: &Path, episodes: u64, threads: usize) -> Result<(RunCo
 
 /// The metrics of a run, one object an iteration.
 pub fn metrics(folder: &Path) -> Result<Vec<Value>> {
-    let path = folder.join(log::FILE);
-    let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
-    text.lines()
-        .map(|line| serde_json::from_str(line).with_context(|| format!("{} is damaged", path.display())))
+    metrics_text(folder)?
+        .lines()
+        .map(|line| {
+            serde_json::from_str(line).with_context(|| format!("{} is damaged", folder.join(log::FILE).display()))
+        })
         .collect()
+}
+
+fn metrics_text(folder: &Path) -> Result<String> {
+    let path = folder.join(log::FILE);
+    std::fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))
 }
 
 /// The lines of the metrics of a run, those of the one before it first, if there was one.
 pub fn metrics_with_pretraining(folder: &Path) -> Result<String> {
-    let read = |folder: &Path| {
-        let path = folder.join(log::FILE);
-        std::fs::read_to_string(&path).with_context(|| format!("cannot read the metrics {}", path.display()))
-    };
     let before = folder.join(PRETRAINING_FOLDER);
-    let before = if before.exists() { read(&before)? } else { String::new() };
-    Ok(before + &read(folder)?)
+    let before = if before.exists() { metrics_text(&before)? } else { String::new() };
+    Ok(before + &metrics_text(folder)?)
 }
 
 /// Wall time that a run and the one before it have taken by their metrics, s; 0 without any. Each time that it was resumed they count from 0 again.
@@ -334,7 +335,7 @@ mod tests {
         write_whole(&b.path().join(CONFIG_FILE), toml::to_string(&config).unwrap().as_bytes()).unwrap();
         run(&before, &b.path().join(PRETRAINING_FOLDER), false);
         assert_eq!(run(&config, b.path(), true), whole);
-        // In another place, with a step more.
+        // In another place.
         let moved = tempfile::tempdir().unwrap();
         let moved = moved.path().join("moved");
         std::fs::rename(b.path(), &moved).unwrap();

@@ -16,16 +16,13 @@ use serde_json::{Value, json};
 use super::rows::measured;
 use crate::cli::export::Measured;
 use crate::cli::{PolicySource, task_by_name};
-use crate::env::FaultTraining;
 use crate::eval::{PUBLISHED_SEED, Trial, parallel};
 use crate::files::{create_folder, write_whole};
-use crate::methods::curriculum::{CurriculumConfig, Pretraining, SecondStage};
 use crate::plot::{Heatmap, MapWords, heatmaps};
 use crate::rows::Rows;
 use crate::run::RunConfig;
 use crate::run_folder::{load_config, load_run, trained};
 use crate::side_by_side::side_by_side;
-use crate::vary::Variation;
 
 /// Makes the fault of a module.
 type Kind = fn(Target) -> FaultKind;
@@ -163,16 +160,11 @@ pub fn run(arguments: &Arguments) -> Result<()> {
 /// The settings of a specialist: those of the robust training on the robot's own length, with this fault in every episode and nothing else broken or
 /// varied.
 fn specialist(task: Task, plan: &FaultPlan, arguments: &Arguments) -> Result<RunConfig> {
-    let mut config = load_config(&arguments.configs.join(format!("{task}.toml")))?;
+    let mut config = load_config(&arguments.configs.join(format!("{task}.toml")))?.plain();
     if config.task.name != task {
         bail!("{} has settings for {}, not for {task}", arguments.configs.display(), config.task.name);
     }
-    config.faults = FaultTraining { fixed: plan.to_string(), ..FaultTraining::default() };
-    config.vary = Variation::default();
-    config.env.lengths = Vec::new();
-    config.train.pretraining = Pretraining::default();
-    config.train.curriculum = CurriculumConfig::default();
-    config.train.second = SecondStage::default();
+    config.faults.fixed = plan.to_string();
     config.train.total_steps = arguments.specialist_steps;
     config.train.evaluate_every = 0;
     if let Some(folder) = &arguments.start {
