@@ -288,6 +288,7 @@ pub fn wall_seconds(run: &Path) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use composer_sim_bridge::faults::Fault;
 
     /// What is pretrained is a run by itself on the robot as it should be, the run begins with its policy, and stopped after either it goes on as if it
     /// had not been.
@@ -317,6 +318,13 @@ mod tests {
         assert!(before.pretraining().is_none());
         assert_eq!((&before.faults, &before.vary), (&FaultTraining::default(), &Default::default()));
         assert!(before.env.lengths.is_empty());
+        let mut blind = config.clone();
+        blind.set("pretraining.blind=1").unwrap();
+        let drawn = blind.pretraining().unwrap().faults.draw(3, 8);
+        assert!(
+            drawn.len() == 1 && matches!(drawn[0].fault, Fault::SensorZeroed(_)) && drawn[0].at_ns == 0,
+            "{drawn:?}"
+        );
 
         let (a, b, alone) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
         let run = |config: &RunConfig, folder: &Path, resuming| {

@@ -65,8 +65,7 @@ impl Variant {
         config.train.seed = seed;
         config.train.total_steps = steps;
         config.train.learning_rate = 7e-4;
-        config.train.evaluate_every = (steps / 10).max(1);
-        config.train.evaluation_episodes = 100;
+        config.train.evaluate_every = 0;
         if self.name.starts_with("without") {
             config.train.method = Method::ComposerNoImagination;
         }

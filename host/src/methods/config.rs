@@ -272,6 +272,7 @@ mod tests {
                 "start = \"a\"\npretraining.steps = 9",
                 "begins with what was pretrained or with start = \"a\", not with both",
             ),
+            ("pretraining.blind = -0.5", "pretraining.blind is -0.5; it must be from 0 to 1"),
             ("inputs = 48\nimagination.told = true", "inputs is 48; with imagination.told it must be 40"),
         ] {
             let config: TrainConfig = toml::from_str(text).unwrap();

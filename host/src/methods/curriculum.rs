@@ -54,8 +54,9 @@ impl CurriculumConfig {
     }
 }
 
-/// Settings of a run before the run, by the paper's protocol: the robot as it should be, of its own length, nothing broken, nothing varied, no message lost.
-/// How the task is done is learnt there, and sooner than among faults; the run itself begins with that policy, a critic of its own and `sigma`.
+/// Settings of a run before the run, by the paper's protocol: the robot as it should be, of its own length, nothing broken but sensors (`blind`), nothing
+/// varied, no message lost. How the task is done is learnt there, and sooner than among faults; the run itself begins with that policy, a critic of its
+/// own and `sigma`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Pretraining {
@@ -65,11 +66,15 @@ pub struct Pretraining {
     pub learning_rate: f64,
     /// Its standard deviation of the actions at the start, as a fraction of the torque limit.
     pub sigma: f64,
+    /// Share of its episodes with one module that senses zeros, 0 for the paper's protocol. No healthy module ever does, so without these what a blind one
+    /// pulls is whatever the weights make of zeros, often more than the torque limit, from where the run itself learns it back slowly. Higher: a blind
+    /// module does less harm, and how the task is done is learnt later.
+    pub blind: f64,
 }
 
 impl Default for Pretraining {
     fn default() -> Self {
-        Self { steps: 0, learning_rate: 7e-4, sigma: 0.45 }
+        Self { steps: 0, learning_rate: 7e-4, sigma: 0.45, blind: 0.0 }
     }
 }
 
@@ -80,6 +85,9 @@ impl Pretraining {
             if !(value.is_finite() && value > 0.0) {
                 bail!("pretraining.{key} is {value}; it must be a number above 0");
             }
+        }
+        if !(0.0..=1.0).contains(&self.blind) {
+            bail!("pretraining.blind is {}; it must be from 0 to 1", self.blind);
         }
         Ok(())
     }
