@@ -209,10 +209,11 @@ impl RunConfig {
 
     /// The run that comes before this one, if one does (`[train.pretraining]`): by the paper's protocol.
     pub fn pretraining(&self) -> Option<RunConfig> {
-        let Pretraining { steps, learning_rate, sigma, blind } = self.train.pretraining;
+        let Pretraining { steps, learning_rate, sigma, environments, minibatches, blind } = self.train.pretraining;
         (steps > 0).then(|| {
             let mut config = self.plain();
-            config.train = TrainConfig { total_steps: steps, learning_rate, sigma, ..config.train };
+            config.train =
+                TrainConfig { total_steps: steps, learning_rate, sigma, environments, minibatches, ..config.train };
             if blind > 0.0 {
                 config.faults = FaultTraining {
                     probability: blind as f32,

@@ -304,6 +304,7 @@ mod tests {
             "evaluation_episodes=1",
             "checkpoint_seconds=0.0",
             "pretraining.steps=32",
+            "pretraining.environments=2",
             "pretraining.sigma=0.4",
             "faults.probability=0.5",
             "env.lengths=[8, 9]",

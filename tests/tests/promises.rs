@@ -163,6 +163,8 @@ fn the_policies_that_ship_are_made_from_nothing_and_the_median_of_the_seeds_ship
                 "evaluation_episodes=1",
                 "--set",
                 "pretraining.steps=128",
+                "--set",
+                "pretraining.environments=4",
             ],
             more,
         ];

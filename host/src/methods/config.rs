@@ -199,10 +199,14 @@ impl TrainConfig {
         if self.checkpoint_seconds.is_nan() || self.checkpoint_seconds < 0.0 {
             bail!("checkpoint_seconds is {}; it must be 0 or more", self.checkpoint_seconds);
         }
+        let samples = |environments: usize| environments.saturating_mul(self.rollout_steps).max(1);
+        let before = &self.pretraining;
         let limits = [
             ("environments", self.environments, 1, 4096),
+            ("pretraining.environments", before.environments, 1, 4096),
             ("rollout_steps", self.rollout_steps, 1, 65_536),
-            ("minibatches", self.minibatches, 1, self.environments.saturating_mul(self.rollout_steps).max(1)),
+            ("minibatches", self.minibatches, 1, samples(self.environments)),
+            ("pretraining.minibatches", before.minibatches, 1, samples(before.environments)),
             ("epochs", self.epochs, 1, 1000),
             ("critic_epochs", self.critic_epochs, 1, 1000),
             ("threads", self.threads, 0, 1024),
@@ -272,6 +276,8 @@ mod tests {
                 "start = \"a\"\npretraining.steps = 9",
                 "begins with what was pretrained or with start = \"a\", not with both",
             ),
+            ("pretraining.environments = 0", "pretraining.environments is 0; it must be from 1 to 4096"),
+            ("pretraining.minibatches = 0", "pretraining.minibatches is 0; it must be from 1 to 2048"),
             ("pretraining.blind = -0.5", "pretraining.blind is -0.5; it must be from 0 to 1"),
             ("inputs = 48\nimagination.told = true", "inputs is 48; with imagination.told it must be 40"),
         ] {

@@ -66,6 +66,10 @@ pub struct Pretraining {
     pub learning_rate: f64,
     /// Its standard deviation of the actions at the start, as a fraction of the torque limit.
     pub sigma: f64,
+    /// Its environments, as [`environments`](super::TrainConfig::environments) of the run. Higher: steadier, and slower at first.
+    pub environments: usize,
+    /// Its minibatches, as [`minibatches`](super::TrainConfig::minibatches) of the run.
+    pub minibatches: usize,
     /// Share of its episodes with one module that senses zeros, 0 for the paper's protocol. No healthy module ever does, so without these what a blind one
     /// pulls is whatever the weights make of zeros, often more than the torque limit, from where the run itself learns it back slowly. Higher: a blind
     /// module does less harm, and how the task is done is learnt later.
@@ -74,7 +78,7 @@ pub struct Pretraining {
 
 impl Default for Pretraining {
     fn default() -> Self {
-        Self { steps: 0, learning_rate: 7e-4, sigma: 0.45, blind: 0.0 }
+        Self { steps: 0, learning_rate: 7e-4, sigma: 0.45, environments: 32, minibatches: 4, blind: 0.0 }
     }
 }
 
