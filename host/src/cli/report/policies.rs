@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail};
 use composer_shared::CRC_32;
 use composer_shared::policy::{Policy, Task};
-use serde_json::{Value, json};
+use serde::{Deserialize, Serialize};
 
 use crate::cli::export::{Exported, Measured, SeedRows, measure, rows};
 use crate::cli::task_by_name;
@@ -257,25 +257,66 @@ fn thinned(metrics: &str, most: usize) -> String {
     String::new()
 }
 
-/// The tables and the data.
+/// What a seed came to, as published: a line of the data, and what the tables are made of.
+#[derive(Clone, Serialize, Deserialize)]
+struct Published {
+    task: String,
+    seed: u64,
+    ships: bool,
+    crc32: String,
+    environment_steps: u64,
+    wall_seconds: f64,
+    parity: Parity,
+    measured: Vec<Measured>,
+}
+
+impl Published {
+    fn of(done: &Done, ships: bool) -> Published {
+        Published {
+            task: done.run.task.name().into(),
+            seed: done.seed(),
+            ships,
+            crc32: format!("{:08x}", crc(&done.image)),
+            environment_steps: done.config.environment_steps(),
+            wall_seconds: wall_seconds(&done.run.folder),
+            parity: done.parity,
+            measured: done.measured.clone(),
+        }
+    }
+
+    fn title(&self) -> &str {
+        Task::ALL.iter().find(|task| task.name() == self.task).map_or(&*self.task, |task| task.title())
+    }
+}
+
+/// The tables and the data. Of tasks that were not asked for what was published before stays.
 fn publish(shipped: &[Shipped], out: &Path) -> Result<()> {
-    let table = tables(shipped)?;
-    let data: Vec<Value> = shipped
-        .iter()
-        .flat_map(|task| task.seeds.iter().enumerate().map(move |(number, done)| (number == task.chosen, done)))
-        .map(|(ships, done)| {
-            json!({
-                "task": done.run.task.name(), "seed": done.seed(), "ships": ships, "crc32": format!("{:08x}", crc(&done.image)),
-                "environment_steps": done.config.environment_steps(), "wall_seconds": wall_seconds(&done.run.folder),
-                "parity": done.parity, "measured": done.measured,
-            })
-        })
-        .collect();
-    write_whole(&out.join("seeds.json"), serde_json::to_string_pretty(&data)?.as_bytes())?;
+    let data_file = out.join("seeds.json");
+    let before: Vec<Published> = match std::fs::read(&data_file) {
+        Ok(text) => serde_json::from_slice(&text)
+            .ok()
+            .filter(|data: &Vec<Published>| data.iter().all(|one| !one.measured.is_empty()))
+            .with_context(|| format!("{} is not what this program publishes: delete it", data_file.display()))?,
+        Err(_) => Vec::new(),
+    };
+    let new = shipped.iter().flat_map(|task| {
+        task.seeds.iter().enumerate().map(move |(number, done)| Published::of(done, number == task.chosen))
+    });
+    let data = with_new(before, new.collect());
+    let table = tables(&data)?;
+    write_whole(&data_file, serde_json::to_string_pretty(&data)?.as_bytes())?;
     write_whole(&out.join("table.md"), table.as_bytes())?;
     print!("{table}");
     println!("\nwritten to {}", out.display());
     Ok(())
+}
+
+/// In the order of the tasks, new ones in the place of those published before.
+fn with_new(mut data: Vec<Published>, new: Vec<Published>) -> Vec<Published> {
+    data.retain(|before| new.iter().all(|new| new.task != before.task));
+    data.extend(new);
+    data.sort_by_key(|one| (Task::ALL.iter().position(|task| task.name() == one.task), one.seed));
+    data
 }
 
 /// What a row is called in the table.
@@ -292,36 +333,36 @@ fn success(row: &Measured, digits: usize) -> String {
 }
 
 /// What ships, then all seeds.
-fn tables(shipped: &[Shipped]) -> Result<String> {
-    let chosen: Vec<&Done> = shipped.iter().map(|task| &task.seeds[task.chosen]).collect();
-    let line = |cell: &dyn Fn(&Done) -> String| chosen.iter().map(|done| cell(done)).collect::<Vec<_>>().join(" | ");
+fn tables(data: &[Published]) -> Result<String> {
+    let chosen: Vec<&Published> = data.iter().filter(|one| one.ships).collect();
+    let line = |cell: &dyn Fn(&Published) -> String| chosen.iter().map(|one| cell(one)).collect::<Vec<_>>().join(" | ");
     let Some(first) = chosen.first() else { bail!("there is no policy to publish") };
     let episodes = first.measured.first().map_or(0, |row| row.episodes);
     let mut table = format!(
         "{episodes} episodes a row, 95 % interval (Wilson); the seed of the median success over all rows with the robot's own modules ships.\n\n"
     );
-    writeln!(table, "| | {} |\n|---|{}", line(&|done| done.run.task.title().into()), "---|".repeat(chosen.len()))?;
+    writeln!(table, "| | {} |\n|---|{}", line(&|one| one.title().into()), "---|".repeat(chosen.len()))?;
     // A task may have a row that the others do not have.
     let mut names: Vec<(String, usize)> = Vec::new();
-    for row in chosen.iter().flat_map(|done| &done.measured) {
+    for row in chosen.iter().flat_map(|one| &one.measured) {
         if !names.iter().any(|(name, _)| *name == heading(row)) {
             names.push((heading(row), names.len()));
         }
     }
     for (name, number) in &names {
-        let cell = |done: &Done| {
-            let row = done.measured.iter().find(|row| heading(row) == *name);
+        let cell = |one: &Published| {
+            let row = one.measured.iter().find(|row| heading(row) == *name);
             row.map_or_else(|| "-".into(), |row| success(row, 3))
         };
         writeln!(table, "| {name} | {} |", line(&cell))?;
         if *number == 0 {
-            writeln!(table, "| control steps | {} |", line(&|done| format!("{:.1}", done.measured[0].steps_mean)))?;
+            writeln!(table, "| control steps | {} |", line(&|one| format!("{:.1}", one.measured[0].steps_mean)))?;
         }
     }
-    writeln!(table, "| seed that ships | {} |", line(&|done| done.seed().to_string()))?;
-    let million = |done: &Done| format!("{:.1}", done.config.environment_steps() as f64 * 1e-6);
+    writeln!(table, "| seed that ships | {} |", line(&|one| one.seed.to_string()))?;
+    let million = |one: &Published| format!("{:.1}", one.environment_steps as f64 * 1e-6);
     writeln!(table, "| trained for, million steps | {} |", line(&million))?;
-    writeln!(table, "| in | {} |\n", line(&|done| format!("{:.0} min", wall_seconds(&done.run.folder) / 60.0)))?;
+    writeln!(table, "| in | {} |\n", line(&|one| format!("{:.0} min", one.wall_seconds / 60.0)))?;
 
     let faults: Vec<&Measured> = first.measured.iter().filter(|row| row.fault != "none").collect();
     let headings: Vec<String> = faults.iter().map(|row| format!("`{}`", row.fault)).collect();
@@ -331,23 +372,21 @@ fn tables(shipped: &[Shipped]) -> Result<String> {
         headings.join(" | "),
         "---|".repeat(4 + faults.len())
     )?;
-    for task in shipped {
-        for (number, done) in task.seeds.iter().enumerate() {
-            let ships = if number == task.chosen { ", ships" } else { "" };
-            let healthy = &done.measured[0];
-            let others =
-                done.measured.iter().filter(|row| row.fault != "none").map(|row| format!("{:.3}", row.success_rate));
-            writeln!(
-                table,
-                "| {} | {}{ships} | {} | {:.1} of {} | {} |",
-                done.run.task.title(),
-                done.seed(),
-                success(healthy, 3),
-                healthy.steps_mean,
-                healthy.cap,
-                others.collect::<Vec<_>>().join(" | ")
-            )?;
-        }
+    for one in data {
+        let ships = if one.ships { ", ships" } else { "" };
+        let healthy = &one.measured[0];
+        let others =
+            one.measured.iter().filter(|row| row.fault != "none").map(|row| format!("{:.3}", row.success_rate));
+        writeln!(
+            table,
+            "| {} | {}{ships} | {} | {:.1} of {} | {} |",
+            one.title(),
+            one.seed,
+            success(healthy, 3),
+            healthy.steps_mean,
+            healthy.cap,
+            others.collect::<Vec<_>>().join(" | ")
+        )?;
     }
     Ok(table)
 }
@@ -363,6 +402,29 @@ mod tests {
         assert_eq!(median(&[0.9, 0.2, 0.5]), 2);
         assert_eq!(median(&[0.9, 0.2]), 1);
         assert_eq!((median(&[0.7]), median(&[0.5, 0.5, 0.5])), (0, 1));
+    }
+
+    #[test]
+    fn a_task_that_was_not_asked_for_keeps_what_was_published() {
+        let one = |task: Task, seed, ships, success_rate| Published {
+            task: task.name().into(),
+            seed,
+            ships,
+            crc32: String::new(),
+            environment_steps: 1_000_000,
+            wall_seconds: 60.0,
+            parity: Parity::of(vec![0.0]),
+            measured: vec![Measured { modules: 8, fault: "none".into(), success_rate, ..Measured::default() }],
+        };
+        let before = vec![one(Task::GoalReaching, 1, true, 0.25), one(Task::WallClimbing, 1, true, 0.5)];
+        let new = vec![one(Task::WallClimbing, 2, true, 0.75), one(Task::WallClimbing, 1, false, 0.625)];
+        let data = with_new(before, new);
+        let order: Vec<(&str, u64)> = data.iter().map(|one| (&*one.task, one.seed)).collect();
+        assert_eq!(order, [("goal-reaching", 1), ("wall-climbing", 1), ("wall-climbing", 2)]);
+        let table = tables(&data).unwrap();
+        assert!(table.contains("| Goal Reaching | 1, ships | 0.250 "), "{table}");
+        assert!(table.contains("| Wall Climbing | 2, ships | 0.750 "), "{table}");
+        assert!(!table.contains("0.500 [") && table.contains("| seed that ships | 1 | 2 |"), "{table}");
     }
 
     #[test]
