@@ -51,13 +51,22 @@ pub const VARIANTS: [Variant; 10] = [
         against: Some("without-table-one"),
     },
     Variant { name: "each", words: "held, every module pays for itself", against: Some("without") },
-    Variant { name: "own-targets", words: "held, imagined by each module's own place", against: Some("without") },
+    Variant {
+        name: "own-targets",
+        words: "held, imagined by each module's own place (tube and wall have no other)",
+        against: Some("without"),
+    },
     Variant { name: "feasible", words: "held, imagination pays for what was missed", against: Some("without") },
     Variant { name: "attends", words: "held, the imagination attends", against: Some("without") },
     Variant { name: "told", words: "held, the control policy is told what is imagined", against: Some("without") },
 ];
 
 impl Variant {
+    /// Whether it differs from the others on a task: a module has a place of its own to be imagined at only in these two.
+    fn concerns(&self, task: Task) -> bool {
+        self.name != "own-targets" || matches!(task, Task::ShapeFormation | Task::BlockPushing)
+    }
+
     /// The settings of a run: the defaults, which are eight healthy modules and nothing varied, at the shipped policies' learning rate.
     pub fn settings(&self, task: Task, seed: u64, steps: u64) -> RunConfig {
         let mut config = RunConfig::default();
@@ -123,7 +132,7 @@ pub struct Found {
 pub fn runs(folder: &Path, tasks: &[Task], seeds: u64, steps: u64) -> Vec<Run> {
     let of = |seed: u64| {
         tasks.iter().flat_map(move |&task| {
-            VARIANTS.iter().enumerate().map(move |(variant, v)| Run {
+            VARIANTS.iter().enumerate().filter(move |(_, v)| v.concerns(task)).map(move |(variant, v)| Run {
                 variant,
                 task,
                 folder: folder.join(format!("{}-{task}-{seed}", v.name)),
@@ -202,7 +211,7 @@ mod tests {
     #[test]
     fn every_variant_differs_from_all_others_and_can_be_trained() {
         let settings: Vec<RunConfig> =
-            VARIANTS.iter().map(|variant| variant.settings(Task::TubeCrossing, 1, 1000)).collect();
+            VARIANTS.iter().map(|variant| variant.settings(Task::ShapeFormation, 1, 1000)).collect();
         for (number, config) in settings.iter().enumerate() {
             config.validate().unwrap();
             assert!(settings[..number].iter().all(|other| other != config), "{}", VARIANTS[number].name);
@@ -211,7 +220,7 @@ mod tests {
         for variant in VARIANTS {
             assert!(variant.against.is_none_or(|name| VARIANTS.iter().any(|other| other.name == name)));
         }
-        assert_eq!(runs(Path::new("x"), &TASKS, 6, 1000).len(), 10 * 3 * 6);
+        assert_eq!(runs(Path::new("x"), &TASKS, 6, 1000).len(), (10 + 9 + 9) * 6);
     }
 
     #[test]
