@@ -27,6 +27,8 @@ use crate::stats::with_interval;
 const IMAGE_FILE: &str = "frozen.policy";
 /// What was measured of it.
 const ROWS_FILE: &str = "measured.json";
+/// What every seed came to, in the folder for the tables.
+const DATA_FILE: &str = "seeds.json";
 /// Most bytes of the metrics that ship with a policy.
 const METRICS_BYTES: usize = 300_000;
 
@@ -117,6 +119,8 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             bail!("{} holds no run of {task} to freeze: without --only-freeze it is trained", arguments.runs.display());
         }
     }
+    // Read first: what cannot be read is said before hours of training.
+    let before = published(&arguments.out.join(DATA_FILE))?;
     // The longest first, so that none is left to run alone at the end.
     runs.sort_by_key(|run| std::cmp::Reverse(run.config.environment_steps()));
     for folder in [&arguments.runs, &arguments.ship, &arguments.out] {
@@ -138,7 +142,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         done.sort_by_key(Done::seed);
         shipped.push(ship(done, &arguments.ship)?);
     }
-    publish(&shipped, &arguments.out)
+    publish(&shipped, before, &arguments.out)
 }
 
 /// Trains, freezes and measures a run as far as that is not done; none if it was interrupted.
@@ -289,22 +293,23 @@ impl Published {
     }
 }
 
+/// What is published already, nothing where there is nothing.
+fn published(data_file: &Path) -> Result<Vec<Published>> {
+    let Ok(text) = std::fs::read(data_file) else { return Ok(Vec::new()) };
+    serde_json::from_slice(&text)
+        .ok()
+        .filter(|data: &Vec<Published>| data.iter().all(|one| !one.measured.is_empty()))
+        .with_context(|| format!("{} is not what this program publishes: delete it", data_file.display()))
+}
+
 /// The tables and the data. Of tasks that were not asked for what was published before stays.
-fn publish(shipped: &[Shipped], out: &Path) -> Result<()> {
-    let data_file = out.join("seeds.json");
-    let before: Vec<Published> = match std::fs::read(&data_file) {
-        Ok(text) => serde_json::from_slice(&text)
-            .ok()
-            .filter(|data: &Vec<Published>| data.iter().all(|one| !one.measured.is_empty()))
-            .with_context(|| format!("{} is not what this program publishes: delete it", data_file.display()))?,
-        Err(_) => Vec::new(),
-    };
+fn publish(shipped: &[Shipped], before: Vec<Published>, out: &Path) -> Result<()> {
     let new = shipped.iter().flat_map(|task| {
         task.seeds.iter().enumerate().map(move |(number, done)| Published::of(done, number == task.chosen))
     });
     let data = with_new(before, new.collect());
     let table = tables(&data)?;
-    write_whole(&data_file, serde_json::to_string_pretty(&data)?.as_bytes())?;
+    write_whole(&out.join(DATA_FILE), serde_json::to_string_pretty(&data)?.as_bytes())?;
     write_whole(&out.join("table.md"), table.as_bytes())?;
     print!("{table}");
     println!("\nwritten to {}", out.display());
@@ -417,6 +422,11 @@ mod tests {
             measured: vec![Measured { modules: 8, fault: "none".into(), success_rate, ..Measured::default() }],
         };
         let before = vec![one(Task::GoalReaching, 1, true, 0.25), one(Task::WallClimbing, 1, true, 0.5)];
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join(DATA_FILE);
+        assert!(published(&file).unwrap().is_empty());
+        std::fs::write(&file, serde_json::to_string(&before).unwrap()).unwrap();
+        let before = published(&file).unwrap();
         let new = vec![one(Task::WallClimbing, 2, true, 0.75), one(Task::WallClimbing, 1, false, 0.625)];
         let data = with_new(before, new);
         let order: Vec<(&str, u64)> = data.iter().map(|one| (&*one.task, one.seed)).collect();
@@ -424,6 +434,12 @@ mod tests {
         let table = tables(&data).unwrap();
         assert!(table.contains("| Goal Reaching | 1, ships | 0.250 "), "{table}");
         assert!(table.contains("| Wall Climbing | 2, ships | 0.750 "), "{table}");
+        for damaged in ["[{}]", "[", &*serde_json::to_string(&data).unwrap().replace("[{\"fault", "[],\"x\":[{\"fault")]
+        {
+            std::fs::write(&file, damaged).unwrap();
+            let error = published(&file).err().unwrap().to_string();
+            assert!(error.ends_with("seeds.json is not what this program publishes: delete it"), "{error}");
+        }
         assert!(!table.contains("0.500 [") && table.contains("| seed that ships | 1 | 2 |"), "{table}");
     }
 
