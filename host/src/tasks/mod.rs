@@ -95,7 +95,7 @@ impl TaskSettings {
     }
 }
 
-mod task_name {
+pub(crate) mod task_name {
     use composer_shared::policy::Task;
     use serde::de::Error;
     use serde::{Deserialize, Deserializer, Serializer};

@@ -58,7 +58,7 @@ pub struct Arguments {
     /// Folder of the settings, TASK.toml, from which a specialist takes the learner's
     #[arg(long, value_name = "DIR", default_value = "host/configs")]
     configs: PathBuf,
-    /// Folder of finished runs, TASK: each specialist begins with the policy of the one of its task; of a task that has none, as by default, from nothing
+    /// Folder of finished runs, TASK: each specialist begins with the policy of the one of its task [default: from nothing]
     #[arg(long, value_name = "DIR")]
     start: Option<PathBuf>,
     /// Change one setting of every specialist, such as learning_rate=3e-4; may be repeated
@@ -157,12 +157,6 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     publish(&table, &data, arguments)
 }
 
-/// The run that a task's specialists begin with.
-fn start(task: Task, arguments: &Arguments) -> Option<PathBuf> {
-    let run = arguments.start.as_ref()?.join(task.name());
-    run.exists().then_some(run)
-}
-
 /// The settings of a specialist: those of the robust training on the robot's own length, with this fault in every episode and nothing else broken or
 /// varied.
 fn specialist(task: Task, plan: &FaultPlan, arguments: &Arguments) -> Result<RunConfig> {
@@ -173,8 +167,8 @@ fn specialist(task: Task, plan: &FaultPlan, arguments: &Arguments) -> Result<Run
     config.faults.fixed = plan.to_string();
     config.train.total_steps = arguments.specialist_steps;
     config.train.evaluate_every = 0;
-    if let Some(run) = start(task, arguments) {
-        config.train.start = run.display().to_string();
+    if let Some(folder) = &arguments.start {
+        config.train.start = folder.join(task.name()).display().to_string();
     }
     for setting in &arguments.settings {
         config.set(setting)?;
@@ -301,30 +295,15 @@ fn rows(
     Ok(())
 }
 
-/// What the specialists began with, in words.
-fn begun(data: &[Value], arguments: &Arguments) -> String {
-    let trained = |task: &Task| data.iter().any(|cell| cell["policy"] == task.name() && !cell["specialist"].is_null());
-    let (started, new): (Vec<Task>, Vec<Task>) =
-        Task::ALL.into_iter().filter(trained).partition(|task| start(*task, arguments).is_some());
-    let titles = |tasks: &[Task]| tasks.iter().map(|task| task.title()).collect::<Vec<_>>().join(", ");
-    match (started.is_empty(), new.is_empty()) {
-        (true, _) => "nothing".into(),
-        (false, true) => "a policy that knows all faults".into(),
-        (false, false) => {
-            format!("a policy that knows all faults ({}) or nothing ({})", titles(&started), titles(&new))
-        }
-    }
-}
-
 fn publish(table: &str, data: &[Value], arguments: &Arguments) -> Result<()> {
     let out: &Path = &arguments.out;
-    let specialists = match arguments.specialists {
-        false => String::new(),
-        true => format!(
-            " Behind \"of\" the success of a specialist, for faults below {}: a float policy trained for {} environment steps with that fault alone, from {}.",
+    let specialists = match (arguments.specialists, &arguments.start) {
+        (false, _) => String::new(),
+        (true, start) => format!(
+            " Behind \"of\" the success of a specialist, for faults below {}: a float policy trained for {} environment steps with that fault alone, {}.",
             arguments.mastered,
             arguments.specialist_steps,
-            begun(data, arguments)
+            if start.is_some() { "from the one policy on" } else { "from nothing" }
         ),
     };
     let table = format!(
@@ -383,23 +362,6 @@ mod tests {
         assert_eq!(metrics.lines().count(), 2);
         assert_eq!(specialists(task, &cells, &found, &kept, &line("0.9")).unwrap(), bounds);
         assert_eq!(std::fs::read_to_string(run.join("metrics.jsonl")).unwrap(), metrics);
-        // Only a task that has a run to begin with begins with it.
-        let mut with_start = line("0.9");
-        with_start.start = Some(folder.path().join("start"));
-        std::fs::create_dir_all(folder.path().join("start/wall-climbing")).unwrap();
-        let cell = |task: Task, bound: Option<Measured>| json!({"policy": task.name(), "specialist": bound});
-        let data = [
-            cell(Task::GoalReaching, bounds[trained[0]].clone()),
-            cell(Task::WallClimbing, bounds[trained[0]].clone()),
-            cell(Task::TubeCrossing, None),
-        ];
-        assert_eq!(begun(&data, &line("0.9")), "nothing");
-        assert_eq!(begun(&data[1..], &with_start), "a policy that knows all faults");
-        assert_eq!(
-            begun(&data, &with_start),
-            "a policy that knows all faults (Wall Climbing) or nothing (Goal Reaching)"
-        );
-        assert_eq!(specialist(task, &cells[0].plan(), &with_start).unwrap().train.start, "");
         assert!(specialists(task, &cells, &found, &kept, &line("0.1")).unwrap().iter().all(Option::is_none));
         // On the map: a share of what it can, 1 where nothing is to be gained.
         let bound = vec![Some(success(0.8)), None];

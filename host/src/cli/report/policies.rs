@@ -22,6 +22,7 @@ use crate::run_folder::{
 };
 use crate::side_by_side::side_by_side;
 use crate::stats::with_interval;
+use crate::tasks::task_name;
 
 /// The image of a run that has been trained to its end, in its folder.
 const IMAGE_FILE: &str = "frozen.policy";
@@ -264,7 +265,8 @@ fn thinned(metrics: &str, most: usize) -> String {
 /// What a seed came to, as published: a line of the data, and what the tables are made of.
 #[derive(Clone, Serialize, Deserialize)]
 struct Published {
-    task: String,
+    #[serde(with = "task_name")]
+    task: Task,
     seed: u64,
     ships: bool,
     crc32: String,
@@ -277,7 +279,7 @@ struct Published {
 impl Published {
     fn of(done: &Done, ships: bool) -> Published {
         Published {
-            task: done.run.task.name().into(),
+            task: done.run.task,
             seed: done.seed(),
             ships,
             crc32: format!("{:08x}", crc(&done.image)),
@@ -286,10 +288,6 @@ impl Published {
             parity: done.parity,
             measured: done.measured.clone(),
         }
-    }
-
-    fn title(&self) -> &str {
-        Task::ALL.iter().find(|task| task.name() == self.task).map_or(&*self.task, |task| task.title())
     }
 }
 
@@ -320,7 +318,7 @@ fn publish(shipped: &[Shipped], before: Vec<Published>, out: &Path) -> Result<()
 fn with_new(mut data: Vec<Published>, new: Vec<Published>) -> Vec<Published> {
     data.retain(|before| new.iter().all(|new| new.task != before.task));
     data.extend(new);
-    data.sort_by_key(|one| (Task::ALL.iter().position(|task| task.name() == one.task), one.seed));
+    data.sort_by_key(|one| (one.task as u8, one.seed));
     data
 }
 
@@ -346,7 +344,7 @@ fn tables(data: &[Published]) -> Result<String> {
     let mut table = format!(
         "{episodes} episodes a row, 95 % interval (Wilson); the seed of the median success over all rows with the robot's own modules ships.\n\n"
     );
-    writeln!(table, "| | {} |\n|---|{}", line(&|one| one.title().into()), "---|".repeat(chosen.len()))?;
+    writeln!(table, "| | {} |\n|---|{}", line(&|one| one.task.title().into()), "---|".repeat(chosen.len()))?;
     // A task may have a row that the others do not have.
     let mut names: Vec<(String, usize)> = Vec::new();
     for row in chosen.iter().flat_map(|one| &one.measured) {
@@ -385,7 +383,7 @@ fn tables(data: &[Published]) -> Result<String> {
         writeln!(
             table,
             "| {} | {}{ships} | {} | {:.1} of {} | {} |",
-            one.title(),
+            one.task.title(),
             one.seed,
             success(healthy, 3),
             healthy.steps_mean,
@@ -412,7 +410,7 @@ mod tests {
     #[test]
     fn a_task_that_was_not_asked_for_keeps_what_was_published() {
         let one = |task: Task, seed, ships, success_rate| Published {
-            task: task.name().into(),
+            task,
             seed,
             ships,
             crc32: String::new(),
@@ -429,7 +427,7 @@ mod tests {
         let before = published(&file).unwrap();
         let new = vec![one(Task::WallClimbing, 2, true, 0.75), one(Task::WallClimbing, 1, false, 0.625)];
         let data = with_new(before, new);
-        let order: Vec<(&str, u64)> = data.iter().map(|one| (&*one.task, one.seed)).collect();
+        let order: Vec<(&str, u64)> = data.iter().map(|one| (one.task.name(), one.seed)).collect();
         assert_eq!(order, [("goal-reaching", 1), ("wall-climbing", 1), ("wall-climbing", 2)]);
         let table = tables(&data).unwrap();
         assert!(table.contains("| Goal Reaching | 1, ships | 0.250 "), "{table}");
