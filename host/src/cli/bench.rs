@@ -11,13 +11,13 @@ use composer_shared::policy::Task;
 use composer_sim_bridge::plant::Bench;
 use composer_sim_bridge::sil::{self, SilConfig};
 
-use super::PolicySource;
 use crate::env::{EnvConfig, SnakeEnv};
 use crate::environment::{Environment, Told, Trivial, View};
 use crate::eval::{DEFAULT_SEED, episode_seed, parallel};
 use crate::methods::{Differentiation, Method, Times, TrainConfig, mix};
 use crate::mjcf::mjcf;
 use crate::policy::{Memories, Policy, Random};
+use crate::policy_source::PolicySource;
 use crate::robot::{Robot, Solver};
 use crate::run::RunConfig;
 use crate::sil::SnakePlant;

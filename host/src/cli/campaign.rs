@@ -13,10 +13,10 @@ use composer_sim_bridge::computer::InProcess;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::{Deserialize, Serialize};
 
-use super::PolicySource;
 use crate::campaign::{Broken, Campaign, Schedule};
 use crate::eval::{DEFAULT_SEED, parallel};
 use crate::files::{create_folder, write_whole};
+use crate::policy_source::PolicySource;
 use crate::robot::Robot;
 use crate::shard::Shard;
 use crate::train::Signals;

@@ -8,10 +8,11 @@ use composer_sim_bridge::faults::{FaultPlan, ScheduledFault};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::physics::Physics;
-use super::{PolicySource, task_by_name};
+use super::task_by_name;
 use crate::env::EnvConfig;
 use crate::eval::{DEFAULT_SEED, PUBLISHED_EPISODES, PUBLISHED_SEED};
 use crate::outcome::Report;
+use crate::policy_source::PolicySource;
 use crate::robot::Robot;
 use crate::stats::with_interval;
 

@@ -10,10 +10,11 @@ use composer_shared::policy::Task;
 use composer_sim_bridge::faults::FaultPlan;
 
 use super::common::{REPLAYED, episode_bar, write_replay};
-use super::{PolicySource, task_by_name};
+use super::task_by_name;
 use crate::bus_trial::{BusReport, BusSettings, BusTrial, Written};
 use crate::env::EnvConfig;
 use crate::eval::DEFAULT_SEED;
+use crate::policy_source::PolicySource;
 use crate::replay::Episode;
 use crate::stats::with_interval;
 use crate::vary::{self, Variation};

@@ -5,10 +5,10 @@ use std::sync::Arc;
 
 use anyhow::{Result, bail};
 
-use super::PolicySource;
 use super::common::{Common, REPLAYED, table, write_replay};
 use crate::env::knows_fault;
 use crate::eval::Trial;
+use crate::policy_source::PolicySource;
 use crate::recorder::record;
 
 /// Arguments of `eval`.

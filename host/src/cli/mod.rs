@@ -12,7 +12,6 @@ mod flash;
 mod key;
 mod mjcf;
 mod physics;
-mod policy_file;
 mod replay;
 mod report;
 mod sign;
@@ -25,8 +24,6 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use composer_shared::policy::Task;
-
-pub use policy_file::PolicySource;
 
 use crate::side_by_side::cores;
 

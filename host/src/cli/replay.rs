@@ -10,8 +10,8 @@ use composer_sim_bridge::candump::Log;
 use composer_sim_bridge::computer::InProcess;
 use composer_sim_bridge::replay::{self, Verdict};
 
-use super::PolicySource;
 use super::sil::{Emulation, transcript_of};
+use crate::policy_source::PolicySource;
 
 /// Arguments of `replay`.
 #[derive(clap::Args, Clone, Debug)]

@@ -16,11 +16,11 @@ use composer_sim_bridge::external_plant::{self, Address};
 use composer_sim_bridge::qemu::{self, Qemu};
 use composer_sim_bridge::sil::SilError;
 
-use super::PolicySource;
 use super::common::{Common, REPLAYED, table, write_replay};
 use crate::bus_trial::{BusReport, BusSettings, BusTrial, Written};
 use crate::external::Elsewhere;
 use crate::mcap::Recording;
+use crate::policy_source::PolicySource;
 
 /// Kind of bus, on the command line.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]

@@ -8,12 +8,12 @@ use anyhow::{Context, Result, bail};
 use composer_shared::policy::Policy;
 use composer_sim_bridge::computer::InProcess;
 
-use super::PolicySource;
 use super::physics::Physics;
 use super::sil::Emulation;
 use crate::eval::parallel;
 use crate::files::write_whole;
 use crate::mjcf::escaped;
+use crate::policy_source::PolicySource;
 use crate::robot::Robot;
 use crate::scenario::{Observed, Ready, Scenario, Verdict};
 

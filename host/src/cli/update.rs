@@ -5,8 +5,8 @@ use std::sync::atomic::Ordering;
 
 use anyhow::{Context, Result, bail};
 
-use super::PolicySource;
 use crate::bus::{Address, BusError, Station, update};
+use crate::policy_source::PolicySource;
 use crate::signing::Package;
 
 /// Arguments of `update`.

@@ -10,7 +10,7 @@ use crate::cli::task_by_name;
 use crate::eval::PUBLISHED_EPISODES;
 use crate::files::{create_folder, write_whole};
 use crate::plot::mean_and_error;
-use crate::study::{Found, Run, TASKS, VARIANTS, ahead, found, runs, wins, work};
+use crate::study::{Found, Run, TASKS, Variant, ahead, found, runs, wins, work};
 
 /// Arguments of `report imagination`.
 #[derive(clap::Args, Clone, Debug)]
@@ -71,9 +71,9 @@ fn table(tasks: &[Task], found: &[Found], arguments: &Arguments) -> Result<Strin
     let titles: Vec<&str> = tasks.iter().map(|task| task.title()).collect();
     let mut table = format!("| | {} | ahead by | of |\n|---|{}\n", titles.join(" | "), "---|".repeat(tasks.len() + 2));
     let mut winners = Vec::new();
-    for variant in &VARIANTS {
+    for variant in Variant::ALL {
         let cells = tasks.iter().map(|task| {
-            let of = found.iter().filter(|found| found.variant == variant.name && found.task == task.name());
+            let of = found.iter().filter(|found| found.variant == variant && found.task == *task);
             let success: Vec<f64> = of.map(|found| found.success).collect();
             let (mean, error) = mean_and_error(&success);
             if success.is_empty() { "-".into() } else { format!("{mean:.2} +- {error:.2} ({})", success.len()) }
@@ -81,12 +81,12 @@ fn table(tasks: &[Task], found: &[Found], arguments: &Arguments) -> Result<Strin
         let cells: Vec<String> = cells.collect();
         let ahead = ahead(variant, found);
         if ahead.is_some_and(wins) {
-            winners.push(variant.words);
+            winners.push(variant.words());
         }
         let [by, pairs] = ahead.map_or(["-".into(), "-".into()], |(mean, error, pairs)| {
             [format!("{mean:+.3} +- {error:.3}"), format!("{pairs} pairs")]
         });
-        writeln!(table, "| {} | {} | {by} | {pairs} |", variant.words, cells.join(" | "))?;
+        writeln!(table, "| {} | {} | {by} | {pairs} |", variant.words(), cells.join(" | "))?;
     }
     writeln!(
         table,

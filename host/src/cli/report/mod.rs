@@ -6,7 +6,6 @@ mod paper;
 mod physics;
 mod policies;
 mod robustness;
-mod rows;
 
 use anyhow::Result;
 

@@ -9,11 +9,11 @@ use composer_shared::policy::Task;
 use composer_sim_bridge::faults::FaultPlan;
 use serde_json::{Value, json};
 
-use super::rows::measured;
-use crate::cli::export::Measured;
 use crate::cli::physics::Physics;
-use crate::cli::{PolicySource, task_by_name};
+use crate::cli::task_by_name;
 use crate::files::{create_folder, write_whole};
+use crate::policy_source::PolicySource;
+use crate::release::measured::{Measured, measured};
 use crate::robot::Robot;
 use crate::robot::Solver;
 use crate::rows::Rows;

@@ -86,13 +86,21 @@ fn manifest_task(text: &str) -> Result<TaskConfig> {
 /// The manifest of a policy that ships.
 fn shipped_manifest(name: &str) -> Option<&'static str> {
     Some(match name {
-        "goal-reaching" => include_str!("../../../shared/policies/goal-reaching.toml"),
-        "block-pushing" => include_str!("../../../shared/policies/block-pushing.toml"),
-        "shape-formation" => include_str!("../../../shared/policies/shape-formation.toml"),
-        "tube-crossing" => include_str!("../../../shared/policies/tube-crossing.toml"),
-        "wall-climbing" => include_str!("../../../shared/policies/wall-climbing.toml"),
+        "goal-reaching" => include_str!("../../shared/policies/goal-reaching.toml"),
+        "block-pushing" => include_str!("../../shared/policies/block-pushing.toml"),
+        "shape-formation" => include_str!("../../shared/policies/shape-formation.toml"),
+        "tube-crossing" => include_str!("../../shared/policies/tube-crossing.toml"),
+        "wall-climbing" => include_str!("../../shared/policies/wall-climbing.toml"),
         _ => return None,
     })
+}
+
+/// Seed of the training of a policy that ships.
+pub fn shipped_seed(name: &str) -> Result<u64> {
+    let text = shipped_manifest(name).with_context(|| format!("no policy {name} ships"))?;
+    let manifest: toml::Table = toml::from_str(text).context("a manifest that ships is TOML")?;
+    let seed = manifest.get("run").and_then(|run| run.get("train")?.get("seed")?.as_integer());
+    seed.and_then(|seed| u64::try_from(seed).ok()).with_context(|| format!("the manifest of {name} has no seed"))
 }
 
 /// A policy to evaluate or to run.
