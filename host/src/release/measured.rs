@@ -16,7 +16,7 @@ use crate::rows::Rows;
 use crate::vary::{self, Variation};
 
 /// One row of measured success: the integer policy in the simulator (`snakectl eval --published`). It is easier there than in training:
-/// [`RunConfig::evaluation`].
+/// [`crate::run::RunConfig::evaluation`].
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Measured {
     /// The faults injected.
