@@ -43,6 +43,12 @@
 //! from the start diverges). If the slope at the end of a step exceeds half of that at its start, it went too far, and a short line search goes back.
 //! It ends when `-gradient . step`, twice the energy still to be gained, is below `solver_tolerance` times `dt`.
 //!
+//! That friction takes the normal force as it is makes `E` no potential, and where friction is steep and what is pushed is light, Newton's steps can lead
+//! away: the head that meets the edge of a block of a few grams, say. A step that does not end within `solver_iterations` sweeps is therefore begun again
+//! with the load of every friction held, first at nothing: then `E` is convex, and Newton's method with its line search cannot fail. What the contacts
+//! come to is halfway taken over as the load, and so on until it changes nothing any more ([`HELD_ROUNDS`] at most). Whatever load it ends with, such
+//! friction only takes power, so that a step that does not converge is less exact but no source of energy.
+//!
 //! No fused multiply-add and no library trigonometry but `libm`'s, so that every processor computes the same bits.
 
 #![expect(clippy::needless_range_loop, reason = "matrices are written with their indices, as in the formulas above")]
@@ -60,6 +66,9 @@ const CAREFUL_SWEEPS: usize = 2;
 const CURVATURE: f32 = 0.8;
 /// Most other lengths of a step of Newton that are tried.
 const TRIALS: usize = 4;
+/// Most times that loads of friction which are held are taken over from the contacts, and how far each time.
+const HELD_ROUNDS: usize = 40;
+const TAKEN_OVER: f32 = 0.5;
 /// Contacts between links whose coupling is exact.
 pub const SELF_CONTACTS: usize = 8;
 /// Most columns: three for each of them, six for the block.
@@ -227,6 +236,8 @@ struct Joint {
     speed: f32,
     torque: f32,
     damping: f32,
+    /// Speed after the last step.
+    old: f32,
     gradient: f32,
     /// What the sweep leaves for the way back.
     step: f32,
@@ -244,9 +255,9 @@ struct Pushed {
     moments: Vec3A,
     friction: f32,
     twist: Spatial,
-    /// Angular momentum and velocity after the last step.
+    /// Angular momentum and twist after the last step.
     momentum: Vec3A,
-    old: Vec3A,
+    old: Spatial,
     inertia: Mat3A,
     hessian: Block,
     gradient: Spatial,
@@ -363,7 +374,9 @@ pub struct Effort {
     pub steps: u64,
     /// Sweeps in all of them.
     pub sweeps: u64,
-    /// Steps that ended at the cap of sweeps.
+    /// Steps that did not end within the cap of sweeps, and were taken again with the loads of friction held.
+    pub held: u64,
+    /// Of those, steps that did not end so either.
     pub capped: u64,
     /// Contacts found, in all steps.
     pub contacts: u64,
@@ -381,7 +394,21 @@ pub struct Chain {
     solids: Vec<Cuboid>,
     block: Option<Pushed>,
     gravity: Vec3A,
+    /// Whether the loads of friction are held in this step.
+    held: bool,
     effort: Effort,
+}
+
+/// Velocity of a link at a contact against the other body's there.
+#[inline(always)]
+fn relative_velocity(links: &[Link], block: Option<&Pushed>, contact: &Contact) -> Vec3A {
+    let velocity = links[contact.link].twist.twist_at(contact.arm).f;
+    velocity
+        - match contact.other {
+            Other::Fixed => Vec3A::ZERO,
+            Other::Link(other) => links[other].twist.twist_at(contact.other_arm).f,
+            Other::Block => block.map_or(Vec3A::ZERO, |block| block.twist.twist_at(contact.other_arm).f),
+        }
 }
 
 /// The rotation by a vector (axis times angle).
@@ -422,7 +449,7 @@ impl Chain {
                 friction: block.friction,
                 twist: Spatial::ZERO,
                 momentum: Vec3A::ZERO,
-                old: Vec3A::ZERO,
+                old: Spatial::ZERO,
                 inertia: Mat3A::ZERO,
                 hessian: Block::ZERO,
                 gradient: Spatial::ZERO,
@@ -441,6 +468,7 @@ impl Chain {
             solids,
             block,
             gravity: Vec3A::from(robot.gravity_vector()),
+            held: false,
             effort: Effort::default(),
         };
         chain.links[0].anchor = Vec3A::new(0.5 * robot.link_length, 0.0, robot.link_radius);
@@ -514,6 +542,7 @@ impl Chain {
                             across,
                             gap,
                             friction,
+                            held: 0.0,
                         });
                     }
                 }
@@ -538,6 +567,7 @@ impl Chain {
                             across,
                             gap,
                             friction,
+                            held: 0.0,
                         });
                     }
                 });
@@ -567,6 +597,7 @@ impl Chain {
                             across,
                             gap,
                             friction: [block.friction; 2],
+                            held: 0.0,
                         });
                     }
                 };
@@ -623,6 +654,7 @@ impl Chain {
                             across,
                             gap,
                             friction: [robot.friction_along, robot.friction_across],
+                            held: 0.0,
                         });
                     }
                 }
@@ -646,14 +678,19 @@ impl Chain {
                 dt * (robot.stiffness * (joint.angle + dt * joint.speed) + joint.damping * joint.speed - joint.torque);
         }
         if let Some(block) = &mut self.block {
-            let f = block.mass * (block.twist.f - block.old - fall);
+            let f = block.mass * (block.twist.f - block.old.f - fall);
             let n = block.inertia * block.twist.n - block.momentum;
             block.gradient = Spatial { n, f };
             let mass = Mat3A::from_diagonal(rapier3d::glamx::glam::Vec3::splat(block.mass));
             block.hessian = Block { a: block.inertia, b: Mat3A::ZERO, c: mass };
             for contact in &block.contacts {
                 let velocity = block.twist.twist_at(contact.arm).f;
-                if let Some(response) = law.respond(contact, velocity, curvature) {
+                let response = if self.held {
+                    law.respond_held(contact, velocity, curvature)
+                } else {
+                    law.respond(contact, velocity, curvature)
+                };
+                if let Some(response) = response {
                     block.gradient.n -= contact.arm.cross(response.impulse);
                     block.gradient.f -= response.impulse;
                     block.hessian.add_lifted(response.hessian, contact.arm);
@@ -662,13 +699,13 @@ impl Chain {
         }
         self.couplings.clear();
         for contact in &self.contacts {
-            let velocity = self.links[contact.link].twist.twist_at(contact.arm).f;
-            let of_other = match contact.other {
-                Other::Fixed => Vec3A::ZERO,
-                Other::Link(other) => self.links[other].twist.twist_at(contact.other_arm).f,
-                Other::Block => self.block.as_ref().map_or(Vec3A::ZERO, |b| b.twist.twist_at(contact.other_arm).f),
+            let velocity = relative_velocity(&self.links, self.block.as_ref(), contact);
+            let response = if self.held {
+                law.respond_held(contact, velocity, curvature)
+            } else {
+                law.respond(contact, velocity, curvature)
             };
-            let Some(response) = law.respond(contact, velocity - of_other, curvature) else { continue };
+            let Some(response) = response else { continue };
             let Response { impulse, mut hessian } = response;
             let couplings = &mut self.couplings;
             let mut in_tree = true;
@@ -871,27 +908,73 @@ impl Chain {
         }
     }
 
+    /// The velocities after the last step, at this place.
+    fn begin(&mut self) {
+        let head = &mut self.links[0];
+        head.twist = Spatial { n: head.old.n, f: head.old.f - head.old.n.cross(0.5 * head.r) };
+        self.joints.iter_mut().for_each(|joint| joint.speed = joint.old);
+        if let Some(block) = &mut self.block {
+            block.twist = block.old;
+        }
+        self.spread();
+    }
+
     /// Velocities at the end of the step.
     fn solve(&mut self, robot: &Robot, law: &Law) {
+        self.effort.steps += 1;
+        self.held = false;
+        self.begin();
+        if self.newton(robot, law).is_some() {
+            return;
+        }
+        self.effort.held += 1;
+        self.held = true;
+        self.begin();
+        for _ in 0..HELD_ROUNDS {
+            match self.newton(robot, law) {
+                None => break,
+                // Nothing was left to be gained with these loads.
+                Some(1) => return,
+                Some(_) => self.take_over_loads(law),
+            }
+        }
+        self.effort.capped += 1;
+    }
+
+    /// Newton's method from the velocities as they are. The sweeps it took; none if they did not lead there.
+    fn newton(&mut self, robot: &Robot, law: &Law) -> Option<usize> {
         self.evaluate(robot, law, 0.0);
         let tolerance = robot.solver_tolerance * law.dt;
-        let mut sweeps = 0;
-        loop {
+        for sweeps in 1..=robot.solver_iterations {
             let gain = self.sweep(robot, law.dt);
-            self.advance(1.0);
-            sweeps += 1;
-            if gain < tolerance {
-                break;
+            self.effort.sweeps += 1;
+            // Not a number, or uphill.
+            if gain.is_nan() || gain <= -tolerance {
+                return None;
             }
-            if sweeps >= robot.solver_iterations {
-                self.effort.capped += 1;
-                break;
+            self.advance(1.0);
+            if gain < tolerance {
+                return Some(sweeps);
             }
             let curvature = if sweeps < CAREFUL_SWEEPS { 0.0 } else { CURVATURE };
             self.search(robot, law, curvature, gain);
         }
-        self.effort.sweeps += sweeps as u64;
-        self.effort.steps += 1;
+        None
+    }
+
+    /// Brings the loads that are held nearer to what the contacts bear at these velocities.
+    fn take_over_loads(&mut self, law: &Law) {
+        let nearer = |contact: &mut Contact, velocity: Vec3A| {
+            contact.held += TAKEN_OVER * (law.load(contact, velocity) - contact.held);
+        };
+        for contact in &mut self.contacts {
+            nearer(contact, relative_velocity(&self.links, self.block.as_ref(), contact));
+        }
+        if let Some(block) = &mut self.block {
+            for contact in &mut block.contacts {
+                nearer(contact, block.twist.twist_at(contact.arm).f);
+            }
+        }
     }
 
     /// One step: `torque` is that on each axis of each module.
@@ -905,15 +988,12 @@ impl Chain {
         };
         for i in 1..self.joints.len() {
             let joint = &mut self.joints[i];
+            joint.old = joint.speed;
             let (module, axis) = robot.motor_of(i - 1);
             joint.torque = torque[module][axis];
             joint.damping = robot.damping_at(joint.speed);
         }
         self.find_contacts(robot);
-        // From the last velocities, at this place.
-        let head = &mut self.links[0];
-        head.twist = Spatial { n: head.old.n, f: head.old.f - head.old.n.cross(0.5 * head.r) };
-        self.spread();
         self.solve(robot, &law);
         self.integrate(robot, dt);
     }
@@ -940,7 +1020,7 @@ impl Chain {
         off /= self.links.len() as f32;
         self.links.iter_mut().for_each(|link| link.anchor += off);
         if let Some(block) = &mut self.block {
-            block.old = block.twist.f;
+            block.old = block.twist;
             block.momentum = block.inertia * block.twist.n;
             block.cuboid.centre += dt * block.twist.f;
             let rotation = rotation_by(dt * block.twist.n) * block.rotation;
@@ -965,7 +1045,7 @@ impl Chain {
         if let (Some(block), Some(out)) = (&self.block, &mut state.block) {
             out.position = block.cuboid.centre.to_array();
             out.rotation = block.rotation.to_array();
-            out.linear = block.old.to_array();
+            out.linear = block.old.f.to_array();
             out.angular = block.twist.n.to_array();
         }
     }
@@ -995,8 +1075,8 @@ impl Chain {
     #[cfg(test)]
     pub fn push_block(&mut self, velocity: [f32; 3]) {
         if let Some(block) = &mut self.block {
-            block.old = Vec3A::from(velocity);
-            block.twist.f = block.old;
+            block.twist.f = Vec3A::from(velocity);
+            block.old = block.twist;
         }
     }
 

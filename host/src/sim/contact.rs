@@ -18,7 +18,8 @@
 //!
 //! A step of length `dt` sees `x = -gap - dt v_n` with the velocity at its end, so both forces are implicit: stable at any step, and a contact
 //! cannot be missed by anything that comes nearer than the margin of the collision tests. In terms of the velocity both are the
-//! gradient of a convex function, except that friction takes `N` as it is: [`Law::respond`] gives impulse and Hessian.
+//! gradient of a convex function, except that friction takes `N` as it is: [`Law::respond`] gives impulse and Hessian. With the load of the friction
+//! held ([`Law::respond_held`]) nothing is excepted.
 
 use rapier3d::glamx::glam::{Mat3A, Vec3A};
 
@@ -54,6 +55,8 @@ pub struct Contact {
     pub gap: f32,
     /// Coefficients of friction along and across.
     pub friction: [f32; 2],
+    /// The normal impulse that friction goes by where it is held.
+    pub held: f32,
 }
 
 impl Contact {
@@ -89,33 +92,86 @@ pub struct Response {
     pub hessian: Mat3A,
 }
 
-impl Law {
-    /// The response to a velocity of the link relative to the other body at the contact. `curvature` from 0 to 1 is the share of the
-    /// friction's curvature in the Hessian: 1 is its derivative, 0 an upper bound of it, with which Newton's steps never overshoot.
+/// Friction of a contact under a load of one.
+struct Sliding {
+    /// Along and across.
+    f: [f32; 2],
+    /// `1 / S`.
+    inverse: f32,
+}
+
+impl Sliding {
     #[inline(always)]
-    pub fn respond(&self, contact: &Contact, velocity: Vec3A, curvature: f32) -> Option<Response> {
-        let Law { dt, stiffness, damping, slip_speed } = *self;
-        let parting = contact.normal.dot(velocity);
-        let deep = -contact.gap - dt * parting;
-        let damped = 1.0 - damping * parting;
-        if deep <= 0.0 || damped <= 0.0 {
-            return None;
-        }
-        let normal = dt * stiffness * deep * damped;
-        let stiff = dt * stiffness * (dt * damped + damping * deep);
+    fn new(contact: &Contact, velocity: Vec3A, slip_speed: f32) -> Self {
         let [mu1, mu2] = contact.friction;
         let (y1, y2) = (mu1 * contact.along.dot(velocity), mu2 * contact.across.dot(velocity));
         let eps = slip_speed * mu1.min(mu2);
         let inverse = 1.0 / (y1 * y1 + y2 * y2 + eps * eps).sqrt();
-        let (f1, f2) = (mu1 * y1 * inverse, mu2 * y2 * inverse);
-        let impulse = normal * (contact.normal - f1 * contact.along - f2 * contact.across);
-        let scale = normal * inverse;
+        Sliding { f: [mu1 * y1 * inverse, mu2 * y2 * inverse], inverse }
+    }
+
+    /// The Hessian of the contact with a normal one of `stiff`, and friction under a load.
+    #[inline(always)]
+    fn hessian(&self, contact: &Contact, stiff: f32, load: f32, curvature: f32) -> Mat3A {
+        let ([mu1, mu2], [f1, f2]) = (contact.friction, self.f);
+        let scale = load * self.inverse;
         let k11 = scale * (mu1 * mu1 - curvature * f1 * f1);
         let k12 = -scale * curvature * f1 * f2;
         let k22 = scale * (mu2 * mu2 - curvature * f2 * f2);
         let (n, a, b) = (contact.normal, contact.along, contact.across);
         let column = |j: usize| (stiff * n[j]) * n + (k11 * a[j] + k12 * b[j]) * a + (k12 * a[j] + k22 * b[j]) * b;
-        Some(Response { impulse, hessian: Mat3A::from_cols(column(0), column(1), column(2)) })
+        Mat3A::from_cols(column(0), column(1), column(2))
+    }
+}
+
+impl Law {
+    /// The response to a velocity of the link relative to the other body at the contact. `curvature` from 0 to 1 is the share of the
+    /// friction's curvature in the Hessian: 1 is its derivative, 0 an upper bound of it, with which Newton's steps never overshoot.
+    #[inline(always)]
+    pub fn respond(&self, contact: &Contact, velocity: Vec3A, curvature: f32) -> Option<Response> {
+        let (deep, damped) = self.pressed(contact, velocity);
+        if deep <= 0.0 || damped <= 0.0 {
+            return None;
+        }
+        let normal = self.dt * self.stiffness * deep * damped;
+        let stiff = self.stiff(deep, damped);
+        let friction = Sliding::new(contact, velocity, self.slip_speed);
+        let impulse = normal * (contact.normal - friction.f[0] * contact.along - friction.f[1] * contact.across);
+        Some(Response { impulse, hessian: friction.hessian(contact, stiff, normal, curvature) })
+    }
+
+    /// Normal impulse at a velocity.
+    pub fn load(&self, contact: &Contact, velocity: Vec3A) -> f32 {
+        let (deep, damped) = self.pressed(contact, velocity);
+        self.dt * self.stiffness * deep.max(0.0) * damped.max(0.0)
+    }
+
+    /// How deep the bodies are in each other at the end of the step, units, and by what damping multiplies the spring; either may be negative.
+    #[inline(always)]
+    fn pressed(&self, contact: &Contact, velocity: Vec3A) -> (f32, f32) {
+        let parting = contact.normal.dot(velocity);
+        (-contact.gap - self.dt * parting, 1.0 - self.damping * parting)
+    }
+
+    /// How the normal impulse falls with the speed of parting.
+    #[inline(always)]
+    fn stiff(&self, deep: f32, damped: f32) -> f32 {
+        self.dt * self.stiffness * (self.dt * damped + self.damping * deep)
+    }
+
+    /// As [`Law::respond`], but friction goes by the load that the contact holds, whatever the velocity: impulse and Hessian are those of a convex function.
+    pub fn respond_held(&self, contact: &Contact, velocity: Vec3A, curvature: f32) -> Option<Response> {
+        let (deep, damped) = self.pressed(contact, velocity);
+        let pressed = deep > 0.0 && damped > 0.0;
+        if !pressed && contact.held == 0.0 {
+            return None;
+        }
+        let (normal, stiff) =
+            if pressed { (self.dt * self.stiffness * deep * damped, self.stiff(deep, damped)) } else { (0.0, 0.0) };
+        let friction = Sliding::new(contact, velocity, self.slip_speed);
+        let held = contact.held * (friction.f[0] * contact.along + friction.f[1] * contact.across);
+        let hessian = friction.hessian(contact, stiff, contact.held, curvature);
+        Some(Response { impulse: normal * contact.normal - held, hessian })
     }
 }
 
@@ -137,6 +193,7 @@ mod tests {
             across,
             gap,
             friction: [0.1, 1.0],
+            held: 0.0,
         }
     }
 
@@ -186,6 +243,33 @@ mod tests {
                     (found - expected).abs() < 2e-2 * expected.abs() + 1e-3,
                     "{velocity} {axis}: {found} {expected}"
                 );
+            }
+        }
+    }
+
+    #[test]
+    fn with_the_load_held_the_hessian_is_the_slope_of_the_whole_impulse() {
+        let c = contact(-0.02);
+        for velocity in [Vec3A::new(0.2, -0.1, 0.02), Vec3A::new(2.0, 1.0, -0.3), Vec3A::new(0.3, 0.1, 5.0)] {
+            let held = Contact { held: 0.7 * LAW.load(&contact(-0.02), Vec3A::ZERO), ..c };
+            let at = |v: Vec3A| LAW.respond_held(&held, v, 1.0).unwrap();
+            for direction in [c.along, c.across, c.normal] {
+                let h = 1e-3 * velocity.length();
+                let slope = (at(velocity - h * direction).impulse - at(velocity + h * direction).impulse) / (2.0 * h);
+                let found = at(velocity).hessian * direction;
+                assert!(
+                    (found - slope).length() < 2e-2 * slope.length() + 1e-3,
+                    "{velocity} {direction}: {found} {slope}"
+                );
+            }
+            // With the load that the contact has at this velocity it is the law itself.
+            let own = Contact { held: LAW.load(&c, velocity), ..c };
+            match (LAW.respond(&c, velocity, 0.8), LAW.respond_held(&own, velocity, 0.8)) {
+                (Some(a), Some(b)) => {
+                    assert!((a.impulse - b.impulse).length() < 1e-6 * a.impulse.length());
+                    assert_eq!(a.hessian, b.hessian);
+                }
+                (a, b) => assert!(a.is_none() && b.is_none()),
             }
         }
     }
