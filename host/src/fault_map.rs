@@ -21,6 +21,7 @@ use crate::rows::Rows;
 use crate::run::RunConfig;
 use crate::run_folder::{load_config, load_run, trained};
 use crate::side_by_side::side_by_side;
+use crate::sim::PHYSICS;
 use crate::tasks::task_name;
 
 /// What can be broken about a module, from the start of the episode on.
@@ -243,7 +244,8 @@ impl Specialists {
         }
         let measured = |one: &Specialist, threads: usize| -> Result<Measured> {
             let digest = CRC_32.checksum(toml::to_string(&one.config)?.as_bytes());
-            let key = format!("{task} specialist {digest:08x} {} episodes={}", one.plan, maps.episodes);
+            let key =
+                format!("{task} specialist {digest:08x} {} episodes={} physics={PHYSICS}", one.plan, maps.episodes);
             kept.get(&key, || {
                 let (config, policy) = load_run(&one.folder)?;
                 let draw = |seed, modules| one.plan.draw(seed, modules);

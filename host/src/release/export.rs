@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
-use anyhow::Result;
+use anyhow::{Context, Result};
 use composer_shared::policy::Policy;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::measured::Measured;
 use crate::files::write_whole;
@@ -13,9 +13,9 @@ use crate::run::RunConfig;
 use crate::run_folder::wall_seconds;
 
 /// What is written beside an image: where it comes from and what it can do.
-#[derive(Serialize)]
+#[derive(Serialize, Deserialize)]
 pub struct Manifest {
-    task: &'static str,
+    task: String,
     image_bytes: usize,
     /// Digest of the task's settings, as the image has it.
     task_digest: String,
@@ -28,13 +28,37 @@ pub struct Manifest {
     parity: Parity,
     measured: Vec<Measured>,
     /// The same of all seeds that it was chosen from, if it was: that of the median success.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
     seeds: Vec<SeedRows>,
     run: RunConfig,
 }
 
+impl Manifest {
+    /// That of an image.
+    pub fn read(image: &Path) -> Result<Self> {
+        let path = image.with_extension("toml");
+        let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
+        toml::from_str(&text)
+            .map_err(|e| anyhow::anyhow!("{} is no manifest of this version: {}", path.display(), e.message()))
+    }
+
+    /// Puts new rows of a seed into the place of those of before, and into that of the image's own if it is the image's.
+    pub fn measured_anew(&mut self, seed: u64, measured: &[Measured]) {
+        if self.run.train.seed == seed {
+            self.measured = measured.to_vec();
+        }
+        let rows = self.seeds.iter_mut().filter(|rows| rows.seed == seed);
+        rows.for_each(|rows| rows.measured = measured.to_vec());
+    }
+
+    /// Writes it beside its image.
+    pub fn write(&self, image: &Path) -> Result<()> {
+        write_whole(&image.with_extension("toml"), toml::to_string(self)?.as_bytes())
+    }
+}
+
 /// What a policy of one of several seeds can do.
-#[derive(Clone, Serialize)]
+#[derive(Clone, Serialize, Deserialize)]
 pub struct SeedRows {
     /// Seed of the run.
     pub seed: u64,
@@ -63,7 +87,7 @@ impl Exported<'_> {
     pub fn write(self, out: &Path, metrics: &[u8]) -> Result<()> {
         let policy = Policy::parse(self.image).map_err(|e| anyhow::anyhow!("{e}"))?;
         let manifest = Manifest {
-            task: policy.task().name(),
+            task: policy.task().name().into(),
             image_bytes: self.image.len(),
             task_digest: format!("{:08x}", policy.task_digest()),
             crc32: format!("{:08x}", policy.crc()),
@@ -76,7 +100,7 @@ impl Exported<'_> {
             run: self.config,
         };
         write_whole(out, self.image)?;
-        write_whole(&out.with_extension("toml"), toml::to_string(&manifest)?.as_bytes())?;
+        manifest.write(out)?;
         write_whole(&out.with_extension("metrics.jsonl"), metrics)
     }
 }

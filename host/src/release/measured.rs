@@ -13,6 +13,7 @@ use crate::eval::{PUBLISHED_SEED, Trial};
 use crate::outcome::Report;
 use crate::policy_source::PolicySource;
 use crate::rows::Rows;
+use crate::sim::PHYSICS;
 use crate::vary::{self, Variation};
 
 /// One row of measured success: the integer policy in the simulator (`snakectl eval --published`). It is easier there than in training:
@@ -127,10 +128,10 @@ pub fn measure(config: &EnvConfig, image: &[u8], row: Row, episodes: u64, thread
     Ok(Measured { on: row.on.words().into(), ..report.into() })
 }
 
-/// What an evaluation depends on besides the policy: robot, task, delay, sensors.
+/// What an evaluation depends on besides the policy: physics, robot, task, delay, sensors.
 pub fn world(env: &crate::env::EnvConfig) -> u32 {
     let text = format!(
-        "{} {:08x} {:?} {:?} {:?}",
+        "{PHYSICS} {} {:08x} {:?} {:?} {:?}",
         env.robot.fingerprint(),
         env.task.digest(),
         env.delay,

@@ -12,6 +12,7 @@ use composer_shared::policy::{Policy, Task};
 
 use crate::files::{create_folder, write_whole};
 use crate::freeze::Parity;
+use crate::policy_source::PolicySource;
 use crate::rows::Rows;
 use crate::run::RunConfig;
 use crate::run_folder::{
@@ -19,7 +20,7 @@ use crate::run_folder::{
     wall_seconds,
 };
 use crate::side_by_side::{cores, side_by_side};
-use export::{Exported, SeedRows};
+use export::{Exported, Manifest, SeedRows};
 use measured::{Measured, measure, rows, world};
 use published::{Published, published, tables, with_new};
 
@@ -29,6 +30,8 @@ const IMAGE_FILE: &str = "frozen.policy";
 const ROWS_FILE: &str = "measured.json";
 /// What every seed came to, in the folder for the tables.
 const DATA_FILE: &str = "seeds.json";
+/// The tables, beside it.
+const TABLE_FILE: &str = "table.md";
 /// Most bytes of the metrics that ship with a policy.
 const METRICS_BYTES: usize = 300_000;
 
@@ -119,6 +122,46 @@ pub fn release(release: &Release) -> Result<Option<String>> {
         shipped.push(ship(done, &release.ship)?);
     }
     publish(&shipped, before, &release.out).map(Some)
+}
+
+/// Measures again what was published, without its runs: every seed whose image is there. For physics, tasks or rows that have changed. The tables.
+pub fn measure_again(release: &Release) -> Result<String> {
+    let data_file = release.out.join(DATA_FILE);
+    let mut data = published(&data_file)?;
+    for number in 0..data.len() {
+        let one = &mut data[number];
+        if !release.tasks.contains(&one.task) {
+            continue;
+        }
+        let shipped = release.ship.join(format!("{}.policy", one.task));
+        let file = if one.ships { shipped.clone() } else { image_file(&release.out, one.task, one.seed) };
+        let Ok(image) = std::fs::read(&file) else {
+            eprintln!("note: {} is not there: the rows of this seed stay as they were", file.display());
+            continue;
+        };
+        if format!("{:08x}", crc(&image)) != one.crc32 {
+            bail!("{} is not the policy that {} tells of, {}", file.display(), data_file.display(), one.crc32);
+        }
+        eprintln!("{}", file.display());
+        // All seeds of a task are trained for the same.
+        let source = PolicySource::load(&shipped.display().to_string())?;
+        let env = source.environment(None, None)?;
+        let measure = |row| measure(&env, &image, row, release.episodes, cores());
+        one.measured = rows(one.task, env.robot.modules).into_iter().map(measure).collect::<Result<_>>()?;
+        let mut manifest = Manifest::read(&shipped)?;
+        manifest.measured_anew(one.seed, &one.measured);
+        manifest.write(&shipped)?;
+        // Each by itself: whoever stops it keeps what is done.
+        write_whole(&data_file, serde_json::to_string_pretty(&data)?.as_bytes())?;
+    }
+    let table = tables(&data)?;
+    write_whole(&release.out.join(TABLE_FILE), table.as_bytes())?;
+    Ok(table)
+}
+
+/// Where the image of a seed is published, if it does not ship.
+fn image_file(out: &Path, task: Task, seed: u64) -> PathBuf {
+    out.join(format!("{task}-{seed}.policy"))
 }
 
 /// The runs, the longest first, so that none is left to run alone at the end.
@@ -253,15 +296,26 @@ fn thinned(metrics: &str, most: usize) -> String {
     String::new()
 }
 
-/// Writes the tables and the data. Of tasks that were not asked for what was published before stays.
+/// Writes the tables, the data and the images that do not ship. Of tasks that were not asked for what was published before stays.
 fn publish(shipped: &[Shipped], before: Vec<Published>, out: &Path) -> Result<String> {
     let new = shipped.iter().flat_map(|task| {
         task.seeds.iter().enumerate().map(move |(number, done)| done.published(number == task.chosen))
     });
     let data = with_new(before, new.collect());
+    for task in shipped {
+        for (number, done) in task.seeds.iter().enumerate() {
+            let file = image_file(out, done.run.task, done.seed());
+            if number == task.chosen {
+                // One of before that ships now stands in the folder for that.
+                let _ = std::fs::remove_file(file);
+            } else {
+                write_whole(&file, &done.image)?;
+            }
+        }
+    }
     let table = tables(&data)?;
     write_whole(&out.join(DATA_FILE), serde_json::to_string_pretty(&data)?.as_bytes())?;
-    write_whole(&out.join("table.md"), table.as_bytes())?;
+    write_whole(&out.join(TABLE_FILE), table.as_bytes())?;
     Ok(table)
 }
 
@@ -276,6 +330,61 @@ mod tests {
         assert_eq!(median(&[0.9, 0.2, 0.5]), 2);
         assert_eq!(median(&[0.9, 0.2]), 1);
         assert_eq!((median(&[0.7]), median(&[0.5, 0.5, 0.5])), (0, 1));
+    }
+
+    #[test]
+    fn what_was_published_is_measured_again_where_its_image_is_there() {
+        let folder = tempfile::tempdir().unwrap();
+        let (ship, out) = (folder.path().join("ship"), folder.path().join("out"));
+        let task = Task::TubeCrossing;
+        let settings = Release {
+            tasks: vec![task],
+            seeds: 3,
+            jobs: None,
+            only_freeze: false,
+            settings: Vec::new(),
+            episodes: 1,
+            configs: PathBuf::new(),
+            runs: PathBuf::new(),
+            ship: ship.clone(),
+            out: out.clone(),
+        };
+        create_folder(&ship).unwrap();
+        create_folder(&out).unwrap();
+        let image = composer_shared::policies::shipped(task.name()).unwrap();
+        let shipped = concat!(env!("CARGO_MANIFEST_DIR"), "/../shared/policies/tube-crossing.policy");
+        let mut manifest = Manifest::read(Path::new(shipped)).unwrap();
+        let own: u64 = 1;
+        let old = || vec![Measured { fault: "none".into(), modules: 8, success_rate: 0.125, ..Measured::default() }];
+        [1, 2, 3].into_iter().for_each(|seed| manifest.measured_anew(seed, &old()));
+        std::fs::write(ship.join("tube-crossing.policy"), image).unwrap();
+        manifest.write(&ship.join("tube-crossing.policy")).unwrap();
+        std::fs::write(image_file(&out, task, 2), image).unwrap();
+        let one = |seed| Published {
+            task,
+            seed,
+            ships: seed == own,
+            crc32: format!("{:08x}", crc(image)),
+            environment_steps: 0,
+            wall_seconds: 0.0,
+            parity: Parity::of(vec![0.0]),
+            measured: old(),
+        };
+        let other = Published { task: Task::GoalReaching, ..one(1) };
+        let write = |data: &[Published]| write_whole(&out.join(DATA_FILE), &serde_json::to_vec(data).unwrap()).unwrap();
+        write(&[other.clone(), one(1), one(2), one(3)]);
+        let table = measure_again(&settings).unwrap();
+        let data = published(&out.join(DATA_FILE)).unwrap();
+        let rows_of = |number: usize| data[number].measured.len();
+        // Another task and a seed without an image have what they had.
+        assert_eq!((rows_of(0), rows_of(1), rows_of(2), rows_of(3)), (1, 13, 13, 1));
+        assert_eq!(data[1].measured, data[2].measured);
+        assert!(table.contains("| Tube Crossing | 3 | 0.125 ") && !table.contains("| Tube Crossing | 2 | 0.125 "));
+        let manifest = std::fs::read_to_string(ship.join("tube-crossing.toml")).unwrap();
+        assert_eq!(manifest.matches("success_rate = 0.125").count(), 1);
+        write(&[Published { crc32: "00000000".into(), ..one(1) }]);
+        let error = measure_again(&settings).unwrap_err().to_string();
+        assert!(error.contains("tube-crossing.policy is not the policy that"), "{error}");
     }
 
     #[test]

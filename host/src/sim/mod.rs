@@ -30,6 +30,11 @@ pub mod scene;
 pub use chain::Effort;
 pub use scene::Scene;
 
+/// Counts the changes of the physics that change what episodes come to: what was measured on another count is measured again.
+///
+/// 2: steps that did not converge do (`chain.rs`).
+pub const PHYSICS: u32 = 2;
+
 /// Temperature of the motors, which is not simulated, degrees Celsius.
 const AMBIENT: f32 = 25.0;
 

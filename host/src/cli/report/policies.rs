@@ -7,7 +7,7 @@ use composer_shared::policy::Task;
 
 use crate::cli::task_by_name;
 use crate::eval::PUBLISHED_EPISODES;
-use crate::release::{Release, release};
+use crate::release::{Release, measure_again, release};
 
 /// Arguments of `report policies`.
 #[derive(clap::Args, Clone, Debug)]
@@ -24,6 +24,9 @@ pub struct Arguments {
     /// Train nothing: freeze, measure and ship what the runs have come to
     #[arg(long)]
     only_freeze: bool,
+    /// Neither train nor freeze: measure again what was published, from the images; for physics that have changed
+    #[arg(long, conflicts_with_all = ["only_freeze", "settings"])]
+    again: bool,
     /// Change one setting of every run, such as total_steps=4096; may be repeated
     #[arg(long = "set", value_name = "KEY=VALUE")]
     settings: Vec<String>,
@@ -49,7 +52,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let arguments = arguments.clone();
     let tasks = if arguments.tasks.is_empty() { Task::ALL.to_vec() } else { arguments.tasks };
     let out = arguments.out.display().to_string();
-    let Some(tables) = release(&Release {
+    let wanted = Release {
         tasks,
         seeds: arguments.seeds,
         jobs: arguments.jobs,
@@ -60,10 +63,9 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         runs: arguments.runs,
         ship: arguments.ship,
         out: arguments.out,
-    })?
-    else {
-        bail!("stopped; the same command goes on from here");
     };
+    let tables = if arguments.again { Some(measure_again(&wanted)?) } else { release(&wanted)? };
+    let Some(tables) = tables else { bail!("stopped; the same command goes on from here") };
     print!("{tables}");
     println!("\nwritten to {out}");
     Ok(())
