@@ -497,8 +497,10 @@ mod tests {
         std::fs::write(&file, "[{}]").unwrap();
         let error = published(&file).err().unwrap().to_string();
         assert!(error.ends_with("map.json is not what this program publishes: delete it"), "{error}");
-        let shipped = concat!(env!("CARGO_MANIFEST_DIR"), "/results/faults/map.json");
-        assert_eq!(published(Path::new(shipped)).unwrap().len(), 5 * 3 * 36);
+        let shipped = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/results/faults"));
+        let data = published(&shipped.join(DATA_FILE)).unwrap();
+        assert_eq!(data.len(), 5 * 3 * 36);
+        assert_eq!(table(&data).unwrap(), std::fs::read_to_string(shipped.join("table.md")).unwrap());
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use crate::env::EnvConfig;
-use crate::sim::{Motion, Snake};
+use crate::sim::{Effort, Motion, Snake};
 use crate::stats::wilson;
 use crate::tasks::Judge;
 use crate::tasks::goal_reaching::Bearing;
@@ -23,6 +23,8 @@ pub struct Episode {
     pub motion: Motion,
     /// Steps whose highest link stayed below two link diameters.
     pub low_steps: u32,
+    /// What the direct solver did.
+    pub effort: Effort,
 }
 
 impl Episode {
@@ -36,6 +38,7 @@ impl Episode {
             bearing: Bearing::of(judge.course().goal),
             motion: snake.motion(),
             low_steps: judge.low_steps(),
+            effort: snake.effort(),
         }
     }
 }
@@ -93,6 +96,8 @@ pub struct Report {
     pub peak_joint_speed: f64,
     /// Share of control steps in which the whole body stayed below two link diameters.
     pub low_share: f64,
+    /// What the direct solver did in all episodes.
+    pub effort: Effort,
 }
 
 impl Report {
@@ -139,6 +144,7 @@ impl Report {
             peak_height: max(&|e| e.motion.peak_height),
             peak_joint_speed: max(&|e| e.motion.peak_joint_speed),
             low_share: low_steps as f64 / total_steps.max(1) as f64,
+            effort: episodes.iter().map(|e| e.effort).sum(),
         }
     }
 }

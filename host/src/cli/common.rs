@@ -133,6 +133,17 @@ pub fn table(report: &Report) -> String {
         report.peak_joint_speed,
         100.0 * report.low_share
     );
+    let effort = report.effort;
+    // Of another engine nothing is known.
+    if effort.steps > 0 {
+        text += &format!(
+            "  physics   {} steps of {:.1} sweeps, {} with the loads of friction held, {} not converged\n",
+            effort.steps,
+            effort.sweeps as f64 / effort.steps as f64,
+            effort.held,
+            effort.capped
+        );
+    }
     text
 }
 

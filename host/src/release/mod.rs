@@ -333,6 +333,22 @@ mod tests {
     }
 
     #[test]
+    fn tables_and_readme_are_of_the_data_that_is_published() {
+        let host = Path::new(env!("CARGO_MANIFEST_DIR"));
+        let text = |file: &str| std::fs::read_to_string(host.join(file)).unwrap();
+        let data = published(&host.join("results/policies").join(DATA_FILE)).unwrap();
+        assert_eq!(tables(&data).unwrap(), text("results/policies/table.md"));
+        let readme = text("../README.md");
+        for line in (text("results/policies/table.md") + &text("results/physics/policies.md")).lines() {
+            assert!(readme.lines().any(|own| own == line), "README.md lacks `{line}`");
+        }
+        for one in data.iter().filter(|one| one.ships) {
+            let policy = composer_shared::policies::shipped(one.task.name()).unwrap();
+            assert_eq!(format!("{:08x}", crc(policy)), one.crc32, "{}", one.task);
+        }
+    }
+
+    #[test]
     fn what_was_published_is_measured_again_where_its_image_is_there() {
         let folder = tempfile::tempdir().unwrap();
         let (ship, out) = (folder.path().join("ship"), folder.path().join("out"));

@@ -368,7 +368,7 @@ impl Couplings {
 }
 
 /// What the solver did.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize)]
 pub struct Effort {
     /// Steps taken.
     pub steps: u64,
@@ -380,6 +380,18 @@ pub struct Effort {
     pub capped: u64,
     /// Contacts found, in all steps.
     pub contacts: u64,
+}
+
+impl std::iter::Sum for Effort {
+    fn sum<I: Iterator<Item = Effort>>(efforts: I) -> Effort {
+        efforts.fold(Effort::default(), |a, b| Effort {
+            steps: a.steps + b.steps,
+            sweeps: a.sweeps + b.sweeps,
+            held: a.held + b.held,
+            capped: a.capped + b.capped,
+            contacts: a.contacts + b.contacts,
+        })
+    }
 }
 
 /// The snake and its scene.

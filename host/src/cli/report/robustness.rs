@@ -3,11 +3,11 @@
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Result, bail};
+use anyhow::{Context, Result, bail};
 use composer_shared::policies;
 use composer_shared::policy::Task;
 use composer_sim_bridge::faults::FaultPlan;
-use serde_json::{Value, json};
+use serde::{Deserialize, Serialize};
 
 use crate::cli::physics::Physics;
 use crate::cli::task_by_name;
@@ -18,6 +18,7 @@ use crate::robot::Robot;
 use crate::robot::Solver;
 use crate::rows::Rows;
 use crate::stats::with_interval;
+use crate::tasks::task_name;
 
 /// Arguments of `report robustness`.
 #[derive(clap::Args, Clone, Debug)]
@@ -61,8 +62,26 @@ fn variants(robot: &Robot) -> Vec<(String, Physics)> {
     rows
 }
 
+/// What is published of a policy in a row: an element of the data, and what the table is made of.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct Measurement {
+    #[serde(rename = "policy", with = "task_name")]
+    task: Task,
+    /// What the row is called.
+    row: String,
+    /// The physics, as `--vary` and its companions have them.
+    physics: String,
+    measured: Measured,
+}
+
+/// What is published, in the folder for it, and the table made of it.
+const DATA_FILE: &str = "policies.json";
+const TABLE_FILE: &str = "policies.md";
+
 /// Runs the verb.
 pub fn run(arguments: &Arguments) -> Result<()> {
+    // Read first: what cannot be read is said before it takes long.
+    let before = published(&arguments.out.join(DATA_FILE))?;
     let names: Vec<&str> = policies::NAMES
         .into_iter()
         .filter(|name| arguments.tasks.is_empty() || arguments.tasks.iter().any(|task| task.name() == *name))
@@ -71,65 +90,114 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     for name in names {
         let source = PolicySource::load(name)?;
         let config = source.environment(None, None)?;
-        shipped.push((name, source, config));
+        shipped.push((config.task.task(), source, config));
     }
     let Some((_, _, first)) = shipped.first() else { bail!("no policy of these tasks ships with this version") };
     create_folder(&arguments.runs)?;
     create_folder(&arguments.out)?;
     let rows = Rows::open(&arguments.runs.join("rows.json"))?;
-    let (mut results, mut left_out) = (Vec::new(), Vec::new());
+    let mut new = Vec::new();
     for (words, physics) in variants(&first.robot) {
         // A version without the solver or the tolerance has no such row.
         if let Err(reason) = physics.apply(first.clone()) {
-            left_out.push(format!("{words}: {reason}"));
+            eprintln!("note: left out: {words}: {reason}");
             continue;
         }
-        let mut cells = Vec::new();
-        for (name, source, config) in &shipped {
-            eprintln!("{words}: {name}");
+        for (task, source, config) in &shipped {
+            eprintln!("{words}: {task}");
             let size = (arguments.episodes, arguments.threads.unwrap_or_else(crate::cli::cores));
             let config = physics.apply(config.clone())?;
-            cells.push(measured(&rows, source, &config, &physics, &FaultPlan::default(), size)?);
+            let measured = measured(&rows, source, &config, &physics, &FaultPlan::default(), size)?;
+            new.push(Measurement { task: *task, row: words.clone(), physics: physics.to_string(), measured });
         }
-        results.push((words, physics, cells));
     }
-    let names: Vec<&str> = shipped.iter().map(|(name, ..)| *name).collect();
-    publish(&names, &results, &left_out, &arguments.out)
+    let data = with_new(before, new);
+    let table = table(&data)?;
+    write_whole(&arguments.out.join(DATA_FILE), serde_json::to_string_pretty(&data)?.as_bytes())?;
+    write_whole(&arguments.out.join(TABLE_FILE), table.as_bytes())?;
+    print!("{table}");
+    println!("\nwritten to {}", arguments.out.display());
+    Ok(())
 }
 
-/// The table and the data.
-fn publish(
-    names: &[&str],
-    results: &[(String, Physics, Vec<Measured>)],
-    left_out: &[String],
-    out: &Path,
-) -> Result<()> {
-    let titles: Vec<&str> = names.iter().filter_map(|name| Task::from_name(name)).map(Task::title).collect();
+/// What is published already, nothing where there is nothing.
+fn published(data_file: &Path) -> Result<Vec<Measurement>> {
+    let Ok(text) = std::fs::read(data_file) else { return Ok(Vec::new()) };
+    serde_json::from_slice(&text)
+        .ok()
+        .with_context(|| format!("{} is not what this program publishes: delete it", data_file.display()))
+}
+
+/// New measurements in the place of those of their tasks; what was published of the others stays. Task by task, in the order of the rows.
+fn with_new(mut data: Vec<Measurement>, new: Vec<Measurement>) -> Vec<Measurement> {
+    data.retain(|before| new.iter().all(|new| new.task != before.task));
+    data.extend(new);
+    data.sort_by_key(|measurement| measurement.task as u8);
+    data
+}
+
+/// A row for each physics, a column for each task.
+fn table(data: &[Measurement]) -> Result<String> {
+    let tasks: Vec<Task> = Task::ALL.into_iter().filter(|task| data.iter().any(|m| m.task == *task)).collect();
+    let titles: Vec<&str> = tasks.iter().map(|task| task.title()).collect();
     let mut table = format!("| physics | {} |\n|---|{}\n", titles.join(" | "), "---|".repeat(titles.len()));
-    let mut data: Vec<Value> = Vec::new();
-    for (words, physics, cells) in results {
-        let success = cells.iter().map(|m| {
-            let success = with_interval(m.success_rate, m.success_low, m.success_high, 3);
-            format!("{success} in {:.1}", m.steps_mean)
-        });
-        writeln!(table, "| {words} | {} |", success.collect::<Vec<_>>().join(" | "))?;
-        for (name, measured) in names.iter().zip(cells) {
-            data.push(json!({"policy": name, "row": words, "physics": physics.to_string(), "measured": measured}));
+    let mut rows: Vec<&str> = Vec::new();
+    for measurement in data {
+        if !rows.contains(&&*measurement.row) {
+            rows.push(&measurement.row);
         }
     }
-    if let Some(measured) = results.iter().find_map(|(_, _, cells)| cells.first()) {
+    for row in rows {
+        let cells = tasks.iter().map(|task| {
+            let of = data.iter().find(|m| m.task == *task && m.row == row);
+            of.map_or_else(
+                || "-".into(),
+                |Measurement { measured: m, .. }| {
+                    let success = with_interval(m.success_rate, m.success_low, m.success_high, 3);
+                    format!("{success} in {:.1}", m.steps_mean)
+                },
+            )
+        });
+        writeln!(table, "| {row} | {} |", cells.collect::<Vec<_>>().join(" | "))?;
+    }
+    if let Some(Measurement { measured, .. }) = data.first() {
         writeln!(
             table,
             "\nSuccess over {} episodes, its 95 % interval (Wilson), and control steps, {} modules, at most {} control steps; the policies are not told.",
             measured.episodes, measured.modules, measured.cap
         )?;
     }
-    for line in left_out {
-        eprintln!("note: left out: {line}");
+    Ok(table)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_task_that_was_not_asked_for_keeps_its_column() {
+        let one = |task, row: &str, success_rate| Measurement {
+            task,
+            row: row.into(),
+            physics: String::new(),
+            measured: Measured { success_rate, ..Measured::default() },
+        };
+        let before = vec![one(Task::TubeCrossing, "as trained", 0.25), one(Task::WallClimbing, "as trained", 0.5)];
+        let new = vec![one(Task::WallClimbing, "as trained", 0.75), one(Task::WallClimbing, "slower", 0.125)];
+        let table = table(&with_new(before, new)).unwrap();
+        assert!(table.contains("| physics | Tube Crossing | Wall Climbing |"), "{table}");
+        assert!(table.contains("| as trained | 0.250 [") && table.contains("| 0.750 ["), "{table}");
+        assert!(table.contains("| slower | - | 0.125 [") && !table.contains("0.500"), "{table}");
     }
-    write_whole(&out.join("policies.json"), serde_json::to_string_pretty(&data)?.as_bytes())?;
-    write_whole(&out.join("policies.md"), table.as_bytes())?;
-    print!("{table}");
-    println!("\nwritten to {}", out.display());
-    Ok(())
+
+    #[test]
+    fn what_is_published_reads_back_to_the_table_beside_it() {
+        let folder = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/results/physics"));
+        let data = published(&folder.join(DATA_FILE)).unwrap();
+        assert_eq!(table(&data).unwrap(), std::fs::read_to_string(folder.join(TABLE_FILE)).unwrap());
+        let damaged = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(damaged.path(), "[{}]").unwrap();
+        let error = published(damaged.path()).unwrap_err().to_string();
+        assert!(error.ends_with("is not what this program publishes: delete it"), "{error}");
+    }
 }
