@@ -77,7 +77,7 @@ impl Trainer {
     }
 
     /// A run as a checkpoint has it. The settings must be those of the checkpoint; only how long it runs, how often it evaluates and
-    /// saves, and the threads may differ. A second stage may be added that begins where the run was to end.
+    /// saves, and the threads may differ.
     pub fn resume(
         checkpoint: &Checkpoint,
         config: &TrainConfig,
@@ -91,7 +91,6 @@ impl Trainer {
             );
         }
         let mut was = config_of(checkpoint)?;
-        let first_stage = was.total_steps;
         was.total_steps = config.total_steps;
         was.evaluate_every = config.evaluate_every;
         was.evaluation_episodes = config.evaluation_episodes;
@@ -99,10 +98,6 @@ impl Trainer {
         was.threads = config.threads;
         // What it began with is behind it, wherever that lies by now.
         was.start.clone_from(&config.start);
-        // Until a second stage begins a run is what it is without, if its rate falls until then.
-        if was.second.from == 0 && config.second.from == first_stage {
-            was.second = config.second.clone();
-        }
         if was != *config {
             let (was, is) = (settings_of(&was)?, settings_of(config)?);
             let changed = was.iter().filter(|setting| !is.contains(setting));
@@ -343,7 +338,6 @@ mod tests {
     use crate::environment::{Environment, Told, Trivial, View};
     use crate::methods::Method;
     use crate::methods::baselines::{MappoConfig, MatConfig};
-    use crate::methods::curriculum::SecondStage;
     use crate::methods::imagination::ImaginationConfig;
     use crate::policy::Memories;
     use crate::robot::Robot;
@@ -401,7 +395,7 @@ mod tests {
     #[test]
     fn a_curriculum_a_second_stage_and_what_modules_remember_go_on_bit_for_bit_whatever_the_threads() {
         use crate::env::{EnvConfig, FaultTraining, SnakeEnv};
-        use crate::methods::curriculum::CurriculumConfig;
+        use crate::methods::curriculum::{CurriculumConfig, SecondStage};
         let make: MakeEnvironment = &|index| {
             let mut env = EnvConfig::new(Task::GoalReaching, Robot::default().with_modules(6 + index % 3)?);
             env.faults = FaultTraining { probability: 0.9, most: 3, mixed: true, latest: 0.3, ..env.faults };
@@ -619,14 +613,6 @@ mod tests {
         without.state.learners.clear();
         let error = Trainer::resume(&without, &config, &teams, "trivial").err().unwrap().to_string();
         assert!(error.contains("0 policies where the method composer-neither has 1"), "{error}");
-        let stage = |from| TrainConfig {
-            total_steps: 3_000_000,
-            second: SecondStage { from, ..SecondStage::default() },
-            ..config.clone()
-        };
-        assert!(Trainer::resume(&checkpoint, &stage(config.total_steps), &teams, "trivial").is_ok());
-        let error = refused(&stage(config.total_steps + 1), "trivial");
-        assert!(error.contains("second.from (it was 0)"), "{error}");
         let longer = TrainConfig { total_steps: 2_000_000, threads: 3, ..config.clone() };
         assert!(Trainer::resume(&checkpoint, &longer, &teams, "trivial").is_ok());
 
