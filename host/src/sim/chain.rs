@@ -46,7 +46,7 @@
 //! That friction takes the normal force as it is makes `E` no potential, and where friction is steep and what is pushed is light, Newton's steps can lead
 //! away: the head that meets the edge of a block of a few grams, say. A step that does not end within `solver_iterations` sweeps is therefore begun again
 //! with the load of every friction held, first at nothing: then `E` is convex, and Newton's method with its line search cannot fail. What the contacts
-//! come to is halfway taken over as the load, and so on until it changes nothing any more ([`HELD_ROUNDS`] at most). Whatever load it ends with, such
+//! come to is halfway taken over as the load, and so on until it changes nothing any more (`HELD_ROUNDS` at most). Whatever load it ends with, such
 //! friction only takes power, so that a step that does not converge is less exact but no source of energy.
 //!
 //! No fused multiply-add and no library trigonometry but `libm`'s, so that every processor computes the same bits.
