@@ -4,19 +4,18 @@
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Result, bail};
 use composer_shared::CRC_32;
 use composer_shared::policy::Task;
 use composer_sim_bridge::faults::{FaultKind, FaultPlan, PlannedFault, Target};
 use serde::{Deserialize, Serialize};
 
-use crate::eval::{PUBLISHED_SEED, Trial, parallel};
-use crate::files::{create_folder, write_whole};
+use crate::eval::parallel;
+use crate::files::{create_folder, read_published, write_whole};
 use crate::plot::{Heatmap, MapWords, heatmaps};
 use crate::policy_source::{PolicySource, shipped_seed};
-use crate::release::measured::{Measured, measured};
+use crate::release::measured::{Measured, measured, published_episodes};
 use crate::rows::Rows;
 use crate::run::RunConfig;
 use crate::run_folder::{load_config, load_run, trained};
@@ -148,7 +147,7 @@ impl FaultMaps {
     /// interrupted, the same call goes on.
     pub fn publish(&self) -> Result<Option<String>> {
         // Read first: what cannot be read is said before it takes hours.
-        let mut data = published(&self.out.join(DATA_FILE))?;
+        let mut data: Vec<Mapped> = read_published(&self.out.join(DATA_FILE), |_| true)?;
         create_folder(&self.runs)?;
         create_folder(&self.out)?;
         let kept = Rows::open(&self.runs.join("rows.json"))?;
@@ -211,14 +210,6 @@ impl FaultMaps {
     }
 }
 
-/// What is published already, nothing where there is nothing.
-fn published(data_file: &Path) -> Result<Vec<Mapped>> {
-    let Ok(text) = std::fs::read(data_file) else { return Ok(Vec::new()) };
-    serde_json::from_slice(&text)
-        .ok()
-        .with_context(|| format!("{} is not what this program publishes: delete it", data_file.display()))
-}
-
 /// A specialist to be trained.
 struct Specialist {
     /// Which cell it is for.
@@ -248,15 +239,8 @@ impl Specialists {
                 format!("{task} specialist {digest:08x} {} episodes={} physics={PHYSICS}", one.plan, maps.episodes);
             kept.get(&key, || {
                 let (config, policy) = load_run(&one.folder)?;
-                let draw = |seed, modules| one.plan.draw(seed, modules);
-                let trial = Trial {
-                    config: &Arc::new(config.evaluation()),
-                    episodes: maps.episodes as usize,
-                    seed: PUBLISHED_SEED,
-                    faults: &draw,
-                    threads,
-                };
-                Ok(trial.evaluate(&*policy.policy(), &one.plan.to_string(), &|| {}).into())
+                let size = (maps.episodes, threads);
+                Ok(published_episodes(config.evaluation(), &*policy.policy(), &one.plan, size))
             })
         };
         let folders: Vec<&Path> = all.iter().map(|one| &*one.folder).collect();
@@ -407,6 +391,10 @@ fn counted(words: impl Iterator<Item = String>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn published(file: &Path) -> Result<Vec<Mapped>> {
+        read_published(file, |_| true)
+    }
     use composer_sim_bridge::faults::Fault;
 
     fn mapped(kind: Kind, modules: [usize; 2], success_rate: f64) -> Mapped {

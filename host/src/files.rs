@@ -5,6 +5,7 @@ use std::io::{self, Write};
 use std::path::Path;
 
 use anyhow::{Context, Result};
+use serde::de::DeserializeOwned;
 
 /// Replaces a file, or makes it: a kill, a full disk or a crash leaves either the old content or the new, never a part.
 pub fn replace(path: &Path, content: &[u8]) -> io::Result<()> {
@@ -38,6 +39,15 @@ pub fn create_folder(path: &Path) -> Result<()> {
     let probe = tempfile::tempfile_in(path);
     probe.with_context(|| format!("cannot write in the folder {}", path.display()))?;
     Ok(())
+}
+
+/// The elements of a JSON file that this program publishes, each as `sound` wants it; none where there is no such file.
+pub fn read_published<T: DeserializeOwned>(file: &Path, sound: impl Fn(&T) -> bool) -> Result<Vec<T>> {
+    let Ok(text) = std::fs::read(file) else { return Ok(Vec::new()) };
+    serde_json::from_slice(&text)
+        .ok()
+        .filter(|data: &Vec<T>| data.iter().all(sound))
+        .with_context(|| format!("{} is not what this program publishes: delete it", file.display()))
 }
 
 #[cfg(test)]

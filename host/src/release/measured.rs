@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::env::EnvConfig;
 use crate::eval::{PUBLISHED_SEED, Trial};
 use crate::outcome::Report;
+use crate::policy;
 use crate::policy_source::PolicySource;
 use crate::rows::Rows;
 use crate::sim::PHYSICS;
@@ -115,17 +116,28 @@ pub fn rows(task: Task, own: usize) -> Vec<Row> {
 pub fn measure(config: &EnvConfig, image: &[u8], row: Row, episodes: u64, threads: usize) -> Result<Measured> {
     let policy = Policy::parse(image).map_err(|e| anyhow::anyhow!("{e}"))?;
     let plan: FaultPlan = row.fault.parse().with_context(|| format!("the fault {}", row.fault))?;
-    let draw = |seed, modules| plan.draw(seed, modules);
     let mut config = EnvConfig { robot: config.robot.with_modules(row.modules)?, ..config.clone() };
     match row.on {
         On::Nominal => {}
         On::Lab => config.vary = Variation::from_toml(vary::LAB).map_err(anyhow::Error::msg)?,
         On::Finer => config = config.finer(4),
     }
+    let measured = published_episodes(config, &policy, &plan, (episodes, threads));
+    // As the row has it: a plan may be written in several ways.
+    Ok(Measured { fault: row.fault.into(), on: row.on.words().into(), ..measured })
+}
+
+/// The first `episodes` published episodes of any policy, with faults as planned.
+pub fn published_episodes(
+    config: EnvConfig,
+    policy: &dyn policy::Policy,
+    plan: &FaultPlan,
+    (episodes, threads): (u64, usize),
+) -> Measured {
+    let draw = |seed, modules| plan.draw(seed, modules);
     let config = Arc::new(config);
     let trial = Trial { config: &config, episodes: episodes as usize, seed: PUBLISHED_SEED, faults: &draw, threads };
-    let report = trial.evaluate(&policy, row.fault, &|| {});
-    Ok(Measured { on: row.on.words().into(), ..report.into() })
+    trial.evaluate(policy, &plan.to_string(), &|| {}).into()
 }
 
 /// What an evaluation depends on besides the policy: physics, robot, task, delay, sensors.
@@ -153,15 +165,5 @@ pub fn measured(
     let image = source.image().context("what ships is an image")?;
     let crc = Policy::parse(image).map_err(|e| anyhow::anyhow!("{e}"))?.crc();
     let key = format!("{} {crc:08x} {words} episodes={episodes} world={:08x}", config.task.task(), world(config));
-    rows.get(&key, || {
-        let draw = |seed, modules| plan.draw(seed, modules);
-        let trial = Trial {
-            config: &Arc::new(config.clone()),
-            episodes: episodes as usize,
-            seed: PUBLISHED_SEED,
-            faults: &draw,
-            threads,
-        };
-        Ok(trial.evaluate(&*source.policy()?, &plan.to_string(), &|| {}).into())
-    })
+    rows.get(&key, || Ok(published_episodes(config.clone(), &*source.policy()?, plan, (episodes, threads))))
 }

@@ -3,11 +3,12 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Result, bail};
 use composer_shared::policy::Task;
 use serde::{Deserialize, Serialize};
 
 use super::measured::Measured;
+use crate::files::read_published;
 use crate::freeze::Parity;
 use crate::stats::with_interval;
 use crate::tasks::task_name;
@@ -36,11 +37,7 @@ pub struct Published {
 
 /// What is published already, nothing where there is nothing.
 pub fn published(data_file: &Path) -> Result<Vec<Published>> {
-    let Ok(text) = std::fs::read(data_file) else { return Ok(Vec::new()) };
-    serde_json::from_slice(&text)
-        .ok()
-        .filter(|data: &Vec<Published>| data.iter().all(|one| !one.measured.is_empty()))
-        .with_context(|| format!("{} is not what this program publishes: delete it", data_file.display()))
+    read_published(data_file, |one: &Published| !one.measured.is_empty())
 }
 
 /// In the order of the tasks, new ones in the place of those published before.

@@ -677,6 +677,11 @@ impl Chain {
     /// Gradient and Hessian of `E` at the twists of this iteration.
     fn evaluate(&mut self, robot: &Robot, law: &Law, curvature: f32) {
         let (dt, mass, moment) = (law.dt, robot.link_mass, robot.link_inertia);
+        let held = self.held;
+        let respond = |contact: &Contact, velocity: Vec3A| match held {
+            true => law.respond_held(contact, velocity, curvature),
+            false => law.respond(contact, velocity, curvature),
+        };
         let fall = self.gravity * dt;
         for link in &mut self.links {
             let centre = 0.5 * link.r;
@@ -697,12 +702,7 @@ impl Chain {
             block.hessian = Block { a: block.inertia, b: Mat3A::ZERO, c: mass };
             for contact in &block.contacts {
                 let velocity = block.twist.twist_at(contact.arm).f;
-                let response = if self.held {
-                    law.respond_held(contact, velocity, curvature)
-                } else {
-                    law.respond(contact, velocity, curvature)
-                };
-                if let Some(response) = response {
+                if let Some(response) = respond(contact, velocity) {
                     block.gradient.n -= contact.arm.cross(response.impulse);
                     block.gradient.f -= response.impulse;
                     block.hessian.add_lifted(response.hessian, contact.arm);
@@ -712,12 +712,7 @@ impl Chain {
         self.couplings.clear();
         for contact in &self.contacts {
             let velocity = relative_velocity(&self.links, self.block.as_ref(), contact);
-            let response = if self.held {
-                law.respond_held(contact, velocity, curvature)
-            } else {
-                law.respond(contact, velocity, curvature)
-            };
-            let Some(response) = response else { continue };
+            let Some(response) = respond(contact, velocity) else { continue };
             let Response { impulse, mut hessian } = response;
             let couplings = &mut self.couplings;
             let mut in_tree = true;

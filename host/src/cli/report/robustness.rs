@@ -1,9 +1,9 @@
 //! `snakectl report robustness`: whether the policies that ship depend on the physics they were trained with.
 
 use std::fmt::Write as _;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Result, bail};
 use composer_shared::policies;
 use composer_shared::policy::Task;
 use composer_sim_bridge::faults::FaultPlan;
@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::cli::physics::Physics;
 use crate::cli::task_by_name;
-use crate::files::{create_folder, write_whole};
+use crate::files::{create_folder, read_published, write_whole};
 use crate::policy_source::PolicySource;
 use crate::release::measured::{Measured, measured};
 use crate::robot::Robot;
@@ -81,7 +81,7 @@ const TABLE_FILE: &str = "policies.md";
 /// Runs the verb.
 pub fn run(arguments: &Arguments) -> Result<()> {
     // Read first: what cannot be read is said before it takes long.
-    let before = published(&arguments.out.join(DATA_FILE))?;
+    let before = read_published(&arguments.out.join(DATA_FILE), |_| true)?;
     let names: Vec<&str> = policies::NAMES
         .into_iter()
         .filter(|name| arguments.tasks.is_empty() || arguments.tasks.iter().any(|task| task.name() == *name))
@@ -118,14 +118,6 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     print!("{table}");
     println!("\nwritten to {}", arguments.out.display());
     Ok(())
-}
-
-/// What is published already, nothing where there is nothing.
-fn published(data_file: &Path) -> Result<Vec<Measurement>> {
-    let Ok(text) = std::fs::read(data_file) else { return Ok(Vec::new()) };
-    serde_json::from_slice(&text)
-        .ok()
-        .with_context(|| format!("{} is not what this program publishes: delete it", data_file.display()))
 }
 
 /// New measurements in the place of those of their tasks; what was published of the others stays. Task by task, in the order of the rows.
@@ -173,6 +165,11 @@ fn table(data: &[Measurement]) -> Result<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::path::Path;
+
+    fn published(file: &Path) -> Result<Vec<Measurement>> {
+        read_published(file, |_| true)
+    }
 
     #[test]
     fn a_task_that_was_not_asked_for_keeps_its_column() {
