@@ -12,7 +12,7 @@ use composer_sim_bridge::faults::{FaultKind, FaultPlan, PlannedFault, Target};
 use serde::{Deserialize, Serialize};
 
 use crate::eval::parallel;
-use crate::files::{create_folder, read_published, write_whole};
+use crate::files::{create_folder, read_published, with_new, write_whole};
 use crate::plot::{Heatmap, MapWords, heatmaps};
 use crate::policy_source::{PolicySource, shipped_seed};
 use crate::release::measured::{Measured, measured, published_episodes};
@@ -147,7 +147,8 @@ impl FaultMaps {
     /// interrupted, the same call goes on.
     pub fn publish(&self) -> Result<Option<String>> {
         // Read first: what cannot be read is said before it takes hours.
-        let mut data: Vec<Mapped> = read_published(&self.out.join(DATA_FILE), |_| true)?;
+        let before: Vec<Mapped> = read_published(&self.out.join(DATA_FILE), |_| true)?;
+        let mut data = Vec::new();
         create_folder(&self.runs)?;
         create_folder(&self.out)?;
         let kept = Rows::open(&self.runs.join("rows.json"))?;
@@ -159,10 +160,9 @@ impl FaultMaps {
                 return Ok(None);
             }
             self.draw(task, &new)?;
-            data.retain(|before| before.task != task);
             data.extend(new);
         }
-        data.sort_by_key(|mapped| (mapped.task as u8, mapped.cell.kind, mapped.cell.modules));
+        let data = with_new(before, data, |one| one.task, |one| (one.task as u8, one.cell.kind, one.cell.modules));
         let table = table(&data)?;
         write_whole(&self.out.join(DATA_FILE), serde_json::to_string_pretty(&data)?.as_bytes())?;
         write_whole(&self.out.join("table.md"), table.as_bytes())?;

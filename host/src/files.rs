@@ -50,6 +50,19 @@ pub fn read_published<T: DeserializeOwned>(file: &Path, sound: impl Fn(&T) -> bo
         .with_context(|| format!("{} is not what this program publishes: delete it", file.display()))
 }
 
+/// What was published with new elements in the place of those that are of the same `part` (of a task, say), all in the `order`.
+pub fn with_new<T, P: PartialEq, O: Ord>(
+    mut before: Vec<T>,
+    new: Vec<T>,
+    part: impl Fn(&T) -> P,
+    order: impl Fn(&T) -> O,
+) -> Vec<T> {
+    before.retain(|before| new.iter().all(|new| part(new) != part(before)));
+    before.extend(new);
+    before.sort_by_key(order);
+    before
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -64,5 +77,12 @@ mod tests {
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
         let error = write_whole(&folder.path().join("none/b"), b"x").unwrap_err().to_string();
         assert!(error.contains("none/b"), "{error}");
+    }
+
+    #[test]
+    fn new_elements_replace_those_of_their_part_alone() {
+        let before = vec![("tube", 2), ("goal", 1), ("tube", 1), ("wall", 1)];
+        let all = with_new(before, vec![("tube", 7), ("goal", 4)], |one| one.0, |one| *one);
+        assert_eq!(all, [("goal", 4), ("tube", 7), ("wall", 1)]);
     }
 }

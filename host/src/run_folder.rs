@@ -89,7 +89,7 @@ pub fn train_in(config: &RunConfig, out: &Path, resuming: bool, beside: &Beside)
         if !resuming {
             let name = beside.name.map_or_else(String::new, |name| format!("{name}/")) + PRETRAINING_FOLDER;
             let beside = Beside { name: Some(&name), ranks: None };
-            let summary = train_in(&before, &folder, can_go_on(&folder, &before)?, &beside)?;
+            let summary = train_in(&before, &folder, resume_or_clear(&folder, &before)?, &beside)?;
             if summary.as_ref().is_none_or(|summary| summary.interrupted) {
                 return Ok(summary);
             }
@@ -181,9 +181,8 @@ pub fn begun(folder: &Path, config: &RunConfig) -> Result<bool> {
     Ok(true)
 }
 
-/// Refuses a folder that holds a run with other settings; whether there is one with these that has a checkpoint. What was killed before it had one is not
-/// there afterwards.
-fn can_go_on(folder: &Path, config: &RunConfig) -> Result<bool> {
+/// Whether a folder holds a run to go on with; one that was killed before its first checkpoint is cleared away, one with other settings refused.
+fn resume_or_clear(folder: &Path, config: &RunConfig) -> Result<bool> {
     let begun = begun(folder, config)?;
     let saved = folder.join(checkpoint::FILE).exists();
     if begun && !saved {
@@ -199,7 +198,7 @@ pub fn trained(folder: &Path, config: &RunConfig, threads: usize) -> Result<bool
     let mut config = config.clone();
     config.train.threads = threads;
     let _alone = alone(folder)?;
-    let begun = can_go_on(folder, &config)?;
+    let begun = resume_or_clear(folder, &config)?;
     let name = folder.file_name().unwrap_or_default().to_string_lossy();
     let beside = Beside { name: Some(&name), ranks: None };
     Ok(train_in(&config, folder, begun, &beside)?.is_some_and(|summary| !summary.interrupted))

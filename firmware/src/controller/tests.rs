@@ -11,6 +11,7 @@ use composer_shared::wire::{ALL_MODULES, Function};
 use proptest::prelude::*;
 
 use crate::motor_health::share;
+use crate::safety::Safety;
 
 use super::*;
 

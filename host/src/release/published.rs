@@ -41,11 +41,8 @@ pub fn published(data_file: &Path) -> Result<Vec<Published>> {
 }
 
 /// In the order of the tasks, new ones in the place of those published before.
-pub fn with_new(mut data: Vec<Published>, new: Vec<Published>) -> Vec<Published> {
-    data.retain(|before| new.iter().all(|new| new.task != before.task));
-    data.extend(new);
-    data.sort_by_key(|one| (one.task as u8, one.seed));
-    data
+pub fn with_new(before: Vec<Published>, new: Vec<Published>) -> Vec<Published> {
+    crate::files::with_new(before, new, |one| one.task, |one| (one.task as u8, one.seed))
 }
 
 /// What a row is called in the table.

@@ -3,6 +3,7 @@
 use super::*;
 use crate::drivers::motor::Trip;
 use crate::limits::{Caps, JointRange};
+use crate::safety::Safety;
 use crate::supply::{Extremes, Thresholds};
 
 const SUPPLY: Thresholds = Thresholds { under: 9.0, over: 16.0 };

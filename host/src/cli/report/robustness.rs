@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::cli::physics::Physics;
 use crate::cli::task_by_name;
-use crate::files::{create_folder, read_published, write_whole};
+use crate::files::{self, create_folder, read_published, write_whole};
 use crate::policy_source::PolicySource;
 use crate::release::measured::{Measured, measured};
 use crate::robot::Robot;
@@ -121,11 +121,8 @@ pub fn run(arguments: &Arguments) -> Result<()> {
 }
 
 /// New measurements in the place of those of their tasks; what was published of the others stays. Task by task, in the order of the rows.
-fn with_new(mut data: Vec<Measurement>, new: Vec<Measurement>) -> Vec<Measurement> {
-    data.retain(|before| new.iter().all(|new| new.task != before.task));
-    data.extend(new);
-    data.sort_by_key(|measurement| measurement.task as u8);
-    data
+fn with_new(before: Vec<Measurement>, new: Vec<Measurement>) -> Vec<Measurement> {
+    files::with_new(before, new, |one| one.task, |one| one.task as u8)
 }
 
 /// A row for each physics, a column for each task.
