@@ -147,8 +147,7 @@ impl FaultMaps {
     /// interrupted, the same call goes on.
     pub fn publish(&self) -> Result<Option<String>> {
         // Read first: what cannot be read is said before it takes hours.
-        let before: Vec<Mapped> = read_published(&self.out.join(DATA_FILE), |_| true)?;
-        let mut data = Vec::new();
+        let mut data: Vec<Mapped> = read_published(&self.out.join(DATA_FILE), |_| true)?;
         create_folder(&self.runs)?;
         create_folder(&self.out)?;
         let kept = Rows::open(&self.runs.join("rows.json"))?;
@@ -160,9 +159,8 @@ impl FaultMaps {
                 return Ok(None);
             }
             self.draw(task, &new)?;
-            data.extend(new);
+            data = with_new(data, new, |one| one.task, |one| (one.task as u8, one.cell.kind, one.cell.modules));
         }
-        let data = with_new(before, data, |one| one.task, |one| (one.task as u8, one.cell.kind, one.cell.modules));
         let table = table(&data)?;
         write_whole(&self.out.join(DATA_FILE), serde_json::to_string_pretty(&data)?.as_bytes())?;
         write_whole(&self.out.join("table.md"), table.as_bytes())?;
@@ -391,11 +389,11 @@ fn counted(words: impl Iterator<Item = String>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use composer_sim_bridge::faults::Fault;
 
     fn published(file: &Path) -> Result<Vec<Mapped>> {
         read_published(file, |_| true)
     }
-    use composer_sim_bridge::faults::Fault;
 
     fn mapped(kind: Kind, modules: [usize; 2], success_rate: f64) -> Mapped {
         let measured = Measured { success_rate, episodes: 2, ..Measured::default() };
@@ -450,6 +448,27 @@ mod tests {
         let settings = start.settings(Task::GoalReaching, &before[0].cell.plan()).unwrap();
         let seed = shipped_seed("goal-reaching").unwrap();
         assert_eq!(settings.train.start, format!("somewhere/goal-reaching-{seed}"));
+    }
+
+    /// Also of what was published before.
+    #[test]
+    fn a_task_that_is_asked_for_twice_is_published_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let maps = FaultMaps {
+            tasks: vec![Task::ShapeFormation; 2],
+            episodes: 1,
+            pair_episodes: 1,
+            specialists: None,
+            threads: 2,
+            runs: folder.path().into(),
+            out: folder.path().into(),
+        };
+        let file = folder.path().join(DATA_FILE);
+        std::fs::write(&file, serde_json::to_string(&[mapped(Kind::MotorsDead, [0, 0], 0.5)]).unwrap()).unwrap();
+        maps.publish().unwrap().unwrap();
+        let data = published(&file).unwrap();
+        assert_eq!(data.len(), 1 + cells(8).len());
+        assert_eq!(data[0].task, Task::GoalReaching);
     }
 
     #[test]
