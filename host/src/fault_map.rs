@@ -202,7 +202,11 @@ impl FaultMaps {
         };
         figure(&format!("{task}.svg"), "success with broken modules", success_maps(data))?;
         if self.specialists.is_some() {
-            figure(&format!("{task}-specialists.svg"), "of what a specialist can", compared(data))?;
+            figure(
+                &format!("{task}-specialists.svg"),
+                "of what a specialist can (grey: none trained)",
+                compared(data),
+            )?;
         }
         Ok(())
     }
@@ -307,12 +311,12 @@ fn success_maps(data: &[Mapped]) -> Vec<Heatmap> {
     maps
 }
 
-/// On the diagonal the share of a specialist's success that the one policy has, 1 where the fault is mastered.
+/// On the diagonal the share of a specialist's success that the one policy has, where there is one.
 fn compared(data: &[Mapped]) -> Vec<Heatmap> {
     let mut maps = empty(data);
     for mapped in data.iter().filter(|mapped| mapped.cell.alone()) {
-        let bound = mapped.specialist.as_ref().map(|bound| bound.measured.success_rate.max(1e-9));
-        let share = bound.map_or(1.0, |bound| mapped.measured.success_rate / bound);
+        let Some(bound) = &mapped.specialist else { continue };
+        let share = mapped.measured.success_rate / bound.measured.success_rate.max(1e-9);
         let map = &mut maps[mapped.cell.kind as usize];
         map.weights[mapped.cell.modules[0] * (map.modules + 1)] = share.min(1.0) as f32;
     }
@@ -483,7 +487,7 @@ mod tests {
         let weights = |maps: Vec<Heatmap>| maps[Kind::MotorsDead as usize].weights.clone();
         assert_eq!(weights(success_maps(&data)), [0.6, 0.25, 0.25, 0.95]);
         let shares = weights(compared(&data));
-        assert!((shares[0], shares[3]) == (0.75, 1.0) && shares[1].is_nan() && shares[2].is_nan(), "{shares:?}");
+        assert!(shares[0] == 0.75 && shares[1..].iter().all(|share| share.is_nan()), "{shares:?}");
         let table = table(&data).unwrap();
         assert!(
             table.contains("| Goal Reaching | motors dead | 0.60 of 0.80 | 0.95 | 0.25 | 0.25 (0 and 1) |"),

@@ -67,7 +67,7 @@ pub struct Heatmap {
     pub title: String,
     /// Modules: the matrix has that many rows (attending) and columns (attended to).
     pub modules: usize,
-    /// Row-major weights, 0 to 1; entries that are missing count as 0.
+    /// Row-major weights, 0 to 1; what is missing or not a number was not measured and is grey.
     pub weights: Vec<f32>,
 }
 
@@ -248,9 +248,8 @@ pub fn heatmaps(maps: &[Heatmap], words: &MapWords) -> String {
     let width = left + maps.len().max(1) as f64 * (cells + gap) + 64.0;
     let height = top + cells + 46.0;
     let mut svg = Svg::new(width, height);
-    let weight =
-        |m: &Heatmap, i: usize| m.weights.get(i).map_or(0.0, |w| if w.is_finite() { f64::from(*w) } else { 0.0 });
-    let largest = maps.iter().flat_map(|m| (0..m.modules * m.modules).map(|i| weight(m, i))).fold(0.0, f64::max);
+    let weight = |m: &Heatmap, i: usize| m.weights.get(i).filter(|w| w.is_finite()).map(|w| f64::from(*w));
+    let largest = maps.iter().flat_map(|m| (0..m.modules * m.modules).filter_map(|i| weight(m, i))).fold(0.0, f64::max);
     let top_value = words.largest.unwrap_or(if largest > 0.0 { largest } else { 1.0 });
     svg.text(width / 2.0, 22.0, "middle", r#" font-weight="bold" font-size="14""#, &words.title);
     for (k, map) in maps.iter().enumerate() {
@@ -261,11 +260,12 @@ pub fn heatmaps(maps: &[Heatmap], words: &MapWords) -> String {
         for i in 0..map.modules {
             for j in 0..map.modules {
                 let (x, y) = (x0 + j as f64 * cell, top + i as f64 * cell);
+                let weight = weight(map, i * map.modules + j);
+                let colour = weight.map_or(NOT_MEASURED.into(), |weight| viridis(weight / top_value));
                 // A hair larger than the cell: no seams where renderers smooth edges.
                 svg.add(format_args!(
-                    r#"<rect x="{x:.2}" y="{y:.2}" width="{0:.2}" height="{0:.2}" fill="{1}"/>"#,
-                    cell + 0.3,
-                    viridis(weight(map, i * map.modules + j) / top_value)
+                    r#"<rect x="{x:.2}" y="{y:.2}" width="{0:.2}" height="{0:.2}" fill="{colour}"/>"#,
+                    cell + 0.3
                 ));
             }
             if i % every == 0 {
@@ -293,6 +293,9 @@ pub fn heatmaps(maps: &[Heatmap], words: &MapWords) -> String {
     svg.text(x + 18.0, top + cells, "start", "", "0");
     svg.finish()
 }
+
+/// A cell of a matrix that nobody measured, no colour of the scale.
+const NOT_MEASURED: &str = "#dddddd";
 
 fn viridis(value: f64) -> String {
     let v = value.clamp(0.0, 1.0) * 8.0;
@@ -464,6 +467,10 @@ mod tests {
         ];
         let svg = heatmaps(&maps, &MapWords::default());
         assert!(svg.contains(&viridis(0.5)) && svg.contains(&viridis(1.0)) && svg.contains("0.50"));
+        assert!(!svg.contains(NOT_MEASURED));
+        let gaps = [Heatmap { title: String::new(), modules: 2, weights: vec![0.0, f32::NAN, 0.5] }];
+        let svg = heatmaps(&gaps, &MapWords::default());
+        assert_eq!(svg.matches(NOT_MEASURED).count(), 2, "one is not a number, one is missing");
         assert_eq!((viridis(0.0).as_str(), viridis(1.0).as_str()), ("#440154", "#fde725"));
     }
 }
